@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from experiments.runs.load_policy import TrainedPolicy
     from mjx_tt.sim.model import SimModel
 
-SHIPPED_POLICY = Path(__file__).parent / "shipped" / "policies" / "quickstart"
 RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
 
 
@@ -55,7 +54,9 @@ def count(text: str) -> Parameter:
 
 BallSeed = Annotated[int | None, option("K", "seed of the balls")]
 Devices = Annotated[int | None, count("host devices (default: one per processor core)")]
-Format = Annotated[str | None, option("NAME", "csv, mcap, bag, deepmind, aimy or spindoe (default: from the suffix)")]
+Format = Annotated[
+    str | None, option("NAME", "csv, mcap, bag, deepmind, aimy, spindoe or events (default: from the file)")
+]
 Model = Annotated[str | None, option("YAML", "another simulation model")]
 Overrides = Annotated[tuple[str, ...], option("KEY=VALUE", "change one key of the file; may be repeated", "--set")]
 PolicyFolder = Annotated[

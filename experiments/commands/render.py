@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from experiments import options
 from experiments.errors import error_context
 from experiments.options import count, option
-from experiments.runs.locate import find_policy
+from experiments.runs.locate import SHIPPED, find_policy
 
 app = options.command(
     "render",
@@ -25,7 +25,7 @@ app = options.command(
 
 @app.default
 def render(
-    policy: options.PolicyFolder = str(options.SHIPPED_POLICY),
+    policy: options.PolicyFolder = str(SHIPPED / "quickstart"),
     /,
     *,
     play: options.PlayOptions = options.PLAY,

@@ -13,8 +13,8 @@ from cyclopts import Parameter
 
 from experiments import options
 from experiments.errors import ConfigError
-from experiments.options import SHIPPED_POLICY, count, option
-from experiments.runs.locate import find_policy, is_exported
+from experiments.options import count, option
+from experiments.runs.locate import SHIPPED, find_policy, is_exported
 
 if TYPE_CHECKING:
     from experiments.view.playlist import Playlist
@@ -101,7 +101,7 @@ def _load_policies(folders: tuple[str, ...], play: options.PlayOptions) -> Playl
     from experiments.runs import load_policy
     from experiments.view import viewer
 
-    trained = [load_policy.load(folder) for folder in folders or (SHIPPED_POLICY,)]
+    trained = [load_policy.load(folder) for folder in folders or (SHIPPED / "quickstart",)]
     if len({one.policy.n_observation for one in trained}) > 1:
         raise ConfigError("policies of robots with different joints are not shown side by side; view them one by one")
     if len({one.policy.network for one in trained}) > 1:

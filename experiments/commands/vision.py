@@ -273,7 +273,7 @@ def calibrate(
             for still, camera in zip(stills, described.cameras, strict=True)
         ]
         rough = replace(described, cameras=tuple(camera for camera, _ in fitted))
-        detectors = [BallDetector(folder, described.rate) for _ in names]
+        detectors = [BallDetector(folder, described.rate, bayer=described.bayer) for _ in names]
         moments = watch.detect_all(watch.pair_frames(Path(recording), described), detectors)
         flights = watch.find_flights(moments, rough)
         if bumped is not None and len(flights) < solve.FEWEST_FLIGHTS:

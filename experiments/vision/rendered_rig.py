@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,7 @@ import mujoco
 import numpy as np
 
 from experiments.vision import render as pictures
-from robot_io.devices.tracker import BallSample, encode
-from robot_io.emulator.tracker import TrackerParams
+from robot_io.emulator.tracker import EmulatedTracker, TrackerParams
 from robot_io.emulator.world import World
 from robot_io.vision.detector import Detector
 from robot_io.vision.rig import CameraRig
@@ -41,30 +39,24 @@ class RenderedCameras:
         return RenderedTracker(self, params, world, seed)
 
 
-class RenderedTracker:
-    """Has the methods of ``TrackerEmulator``; what it does with a frame is what ``mjx-tt vision run`` does."""
+class RenderedTracker(EmulatedTracker):
+    """What it does with a frame is what ``mjx-tt vision run`` does."""
 
     def __init__(self, cameras: RenderedCameras, params: TrackerParams, world: World, seed: int) -> None:
-        self._world, self._params, rig = world, params, cameras.rig
-        self._random, self._watch = np.random.default_rng(seed), cameras.watch
+        super().__init__(params, seed)
+        self._world, self._watch, rig = world, cameras.watch, cameras.rig
         self._scenes = [pictures.make_scene(camera, self._random) for camera in rig.cameras]
         for scene in self._scenes:
             scene.exposure, scene.ball = rig.exposure, self._scenes[0].ball
         self._person = pictures.Actors(self._random, clutter=0)
         self._detectors = [Detector(cameras.detector, params.rate) for _ in rig.cameras]
         self.tracker = BallTracker((cameras.believed or rig).cameras)
-        self._waiting: deque[tuple[float, bytes]] = deque()
-        self._sequence, self._silent_until = 0, -np.inf
         model = world.model
         self._capsules = [
             i
             for i in range(model.ngeom)
             if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE and model.geom_bodyid[i] > 0
         ]
-
-    def drop_out(self, until: float) -> None:
-        """Sends nothing until then."""
-        self._silent_until = until
 
     def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
         """Exposes a frame in whose middle the ball is at a position (3,) [m], or nowhere; its number is not seen."""
@@ -84,21 +76,10 @@ class RenderedTracker:
         tracked = self.tracker.update(now, found)
         if self._watch is not None:
             self._watch(tracked, position)
-        sample = BallSample(self._sequence, self.tracker.number, now, None)
+        seen: tuple[np.ndarray, ...] = ()
         if tracked is not None and tracked.seen:
-            sample = BallSample(
-                self._sequence, tracked.number, now, tracked.position, tracked.velocity, tracked.covariance
-            )
-        if now >= self._silent_until:
-            self._waiting.append((now + self._params.latency, encode(sample)))
-        self._sequence += 1
-
-    def due(self, now: float) -> list[bytes]:
-        """Datagrams that are ready to be sent."""
-        ready = []
-        while self._waiting and self._waiting[0][0] <= now + 1e-9:
-            ready.append(self._waiting.popleft()[1])
-        return ready
+            seen = tracked.position, tracked.velocity, tracked.covariance
+        self._send(now, self.tracker.number, now, *(seen or (None,)))
 
     def _robot(self) -> list[pictures.Capsule]:
         """The robot's capsules, and its blade."""

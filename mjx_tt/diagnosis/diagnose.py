@@ -32,7 +32,8 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 
 SPINS = ("auto", "none", "free")
-SPINS_PAY = 4.0  # standard errors by which unseen balls must be predicted better with spins
+# Unseen balls must be predicted better with spins, by so many standard errors or to this part of the error without.
+SPINS_SURE, SPINS_PAY = 2.5, 0.8
 SPINS_LEAD = 0.6  # of the error without, below which spins are a cause though something stays unexplained
 
 
@@ -152,6 +153,6 @@ def _of_balls(
     # Spins of their own let balls take up much that is none: they must pay, and leave nothing open.
     gain = np.log(prediction.after / of_spun.after)
     gain = gain[np.isfinite(gain)]
-    pays = gain.mean() > SPINS_PAY * gain.std() / np.sqrt(max(gain.size, 1))
+    pays = gain.mean() > SPINS_SURE * gain.std() / np.sqrt(max(gain.size, 1)) or with_spins < SPINS_PAY * plain
     chosen = pays and (not spun.unexplained or with_spins < SPINS_LEAD * plain)
     return (spun, of_spun, [note]) if chosen else (found, prediction, [note])

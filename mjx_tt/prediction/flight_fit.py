@@ -18,7 +18,7 @@ from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball.cross_validation import BELIEVED
 from mjx_tt.diagnosis.ball.flights import marginal, noise
-from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_with_information, heading, own_spins
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_flights, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import Flown, grid, leaves
 from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, SPIN, START_STEPS, BallProblem, Situation
@@ -84,7 +84,7 @@ def fit_states(tracks: Sequence[Trajectory], belief: Belief) -> Fitted:
     unknowns = 6 if spins is None else 9
     own = replace(noise.nominal_noise(g), scatter=belief.scatter)
     for _ in range(ROUNDS):
-        start, active, information = fit_with_information(problem, nothing, start, g, own, spins)
+        start, _, active, information, _ = fit_flights(problem, nothing, start, g, own, spins, rounds=8)
         flown = problem.fly(nothing, start)
         residual = np.where(g.mask, g.measured - flown.measured[:, :, 0], 0.0)
         frame = noise.flight_frame(flown.velocity[:, :, 0])

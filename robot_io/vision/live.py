@@ -68,7 +68,7 @@ def run(
     with ExitStack() as stack:
         wire = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         cameras = [
-            stack.enter_context(CameraProcess(camera, source, detector, rig.rate))
+            stack.enter_context(CameraProcess(camera, source, detector, rig.rate, rig.bayer))
             for camera, source in zip(rig.cameras, sources, strict=True)
         ]
         while (looks := _together(cameras, rig, health)) is not None and not until():

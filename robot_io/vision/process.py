@@ -34,7 +34,7 @@ class Look(NamedTuple):
 class CameraProcess:
     """A camera's process; use as a context manager. Raises DeviceError where it does not start or ends by an error."""
 
-    def __init__(self, camera: Camera, source: Source, detector: Path, rate: float) -> None:
+    def __init__(self, camera: Camera, source: Source, detector: Path, rate: float, bayer: str) -> None:
         self.camera = camera
         width, height = camera.size
         self._memory = SharedMemory(create=True, size=RING * width * height + 8 * (1 + 2 * GUESSES))
@@ -45,7 +45,7 @@ class CameraProcess:
         self._free = context.Semaphore(RING - 3)  # the detector holds three
         self._process = context.Process(
             target=_run,
-            args=(source, detector, rate, camera.size, self._memory.name, theirs, self._free),
+            args=(source, detector, rate, bayer, camera.size, self._memory.name, theirs, self._free),
             name=f"camera-{camera.name}",
             daemon=True,
         )
@@ -99,7 +99,14 @@ def _views(memory: SharedMemory, size: tuple[int, int]) -> tuple[np.ndarray, np.
 
 
 def _run(
-    source: Source, folder: Path, rate: float, size: tuple[int, int], name: str, pipe: Connection, free: Semaphore
+    source: Source,
+    folder: Path,
+    rate: float,
+    bayer: str,
+    size: tuple[int, int],
+    name: str,
+    pipe: Connection,
+    free: Semaphore,
 ) -> None:
     import cv2
 
@@ -109,7 +116,7 @@ def _run(
     memory = SharedMemory(name=name, **({"track": False} if "track" in SharedMemory.__init__.__annotations__ else {}))
     frames, guesses = _views(memory, size)
     try:
-        detector = Detector(folder, rate)
+        detector = Detector(folder, rate, bayer=bayer)
         for count, (stamp, frame) in enumerate(source.frames()):
             if frame.shape != frames.shape[1:]:
                 pipe.send(f"expected frames of {size} px, got {frame.shape[::-1]}; correct size in the rig's YAML")

@@ -15,6 +15,7 @@ from mjx_tt.diagnosis.ball.diagnose import BallFindings, jitter_cause
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights import tracker_gate
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS
+from mjx_tt.diagnosis.ball.search import NO_ERROR, Sizes
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Left, Part, Together, Unexplained
 from mjx_tt.sim import model as models
 from mjx_tt.sim.randomisation import Samples
@@ -73,8 +74,14 @@ def part(
 
 
 def _left(found: BallFindings) -> Left:
-    rest, share, nominal = found.search.left_over
-    return Left(1e3 * float(np.sqrt(rest)), share, 1e3 * float(np.sqrt(nominal)))
+    """What the extended model leaves, bounces all alike."""
+    search = found.search
+    rest = search.remaining
+    if found.companions:
+        sizes = Sizes(found.problem, search.at, search.noise, search.prior)
+        rest = sizes(sizes.theta(search.model, (*search.chosen, *found.companions)))
+    left, whole = (max(x[1] - search.level, 1e-12) for x in (rest, search.errors))
+    return Left(1e3 * float(np.sqrt(left)), float(left / whole), 1e3 * float(np.sqrt(whole)))
 
 
 def _where(found: BallFindings, name: str) -> str:
@@ -228,7 +235,7 @@ def _spin_cause(found: BallFindings, wide: float, error: Float[np.ndarray, " K"]
     text = "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading
     # Without spins, and all other causes, the nominal model is left.
     most = max([search.remaining[1], *(w[1] for w in search.without.values())])
-    share = 1.0 - (most - search.level) / max(search.errors[1] - search.level, 1e-12)
+    share = 1.0 - (most - search.level) / max(search.errors[1] - search.level, NO_ERROR)
     cause = Cause("magnus", ("magnus",), 1.0, parameters, float(1e3 * rms * search.spin_shift), text, share)
     coefficient = {path: e for path, e in parameters.items() if path == MAGNUS}  # the spins are a distribution already
     return replace(Expressed.by(cause, parameters), ranges=Expressed.by(cause, coefficient).ranges)

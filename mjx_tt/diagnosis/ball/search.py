@@ -28,6 +28,7 @@ HALF = 0.5  # of all that the evidence gains, by which a single cause is looked 
 PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
 LEAST_SHARE = 0.01  # of the error, that a cause must take away
+NO_ERROR = 1e-6  # [m^2] beside the noise, below which there is nothing to take away: a millimetre
 LEADING_SHARE = 0.9  # of the error, beyond which a cause is named though a smooth function could stand for it
 LEAST_EVIDENCE = 2.0  # of the logarithm, that each cause must bring beside the best discrepancy
 PRICE_OF_SPINS = 20.0  # the same of a coefficient of lift and of the nine numbers of a distribution
@@ -70,13 +71,7 @@ class Search:
 
     def share(self, member: int) -> float:
         """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
-        return float(np.max((self.without[member] - self.remaining) / np.maximum(self.errors - self.level, 1e-12)))
-
-    @property
-    def left_over(self) -> tuple[float, float, float]:
-        """Error beside the chosen causes, its part of the nominal model's, and that [m^2], bounces all alike."""
-        rest, whole = max(self.remaining[1] - self.level, 0.0), max(self.errors[1] - self.level, 1e-12)
-        return float(rest), float(rest / whole), float(whole)
+        return float(np.max((self.without[member] - self.remaining) / np.maximum(self.errors - self.level, NO_ERROR)))
 
 
 def search(
@@ -331,7 +326,7 @@ def _choose(
         count = 1  # to be looked at from there: what is far off is not told from here
     errors = [sizes(sizes.theta(model, s)) for s in path[: max(count, 1) + 1]]
     whole = np.maximum(errors[0], error) - level
-    gained = [float(np.max((a - b) / np.maximum(whole, 1e-12))) for a, b in zip(errors, errors[1:], strict=False)]
+    gained = [float(np.max((a - b) / np.maximum(whole, NO_ERROR))) for a, b in zip(errors, errors[1:], strict=False)]
     while not early and count and gained[count - 1] < LEAST_SHARE:
         count -= 1
     if count == 0 and gained and gained[0] > LEADING_SHARE:

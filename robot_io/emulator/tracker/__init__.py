@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeAlias, get_args
@@ -52,20 +53,36 @@ class TrackerParams:
         return world.strokes if self.identity == "stroke" else world.number, world.visible and not hidden
 
 
-class EmulatedTracker(Protocol):
-    """A tracker of the rig."""
+class EmulatedTracker(ABC):
+    """A tracker of the rig: frames become datagrams that wait for its latency; ``step`` once per 1 / rate seconds."""
+
+    def __init__(self, params: TrackerParams, seed: int) -> None:
+        self._params, self._random = params, np.random.default_rng(seed)
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._sequence, self._silent_until = 0, -np.inf
+
+    @abstractmethod
+    def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
+        """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
 
     def drop_out(self, until: float) -> None:
         """Sends nothing until then."""
-        ...
-
-    def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
-        """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
-        ...
+        self._silent_until = until
 
     def due(self, now: float) -> list[bytes]:
         """Datagrams that are ready to be sent."""
-        ...
+        ready = []
+        while self._waiting and self._waiting[0][0] <= now + 1e-9:
+            ready.append(self._waiting.popleft()[1])
+        return ready
+
+    def _send(self, now: float, ball: int, captured: float, *seen: np.ndarray | None) -> None:
+        """A frame of ``now``: ball, stamp, and position, velocity and covariance as far as they are known."""
+        if now >= self._silent_until:
+            self._waiting.append(
+                (now + self._params.latency, encode(BallSample(self._sequence, ball, captured, *seen)))
+            )
+        self._sequence += 1
 
 
 class TrackerMaker(Protocol):
@@ -76,24 +93,17 @@ class TrackerMaker(Protocol):
         ...
 
 
-class TrackerEmulator:
-    """Frames of the ball; ``step`` once per 1 / rate seconds."""
+class TrackerEmulator(EmulatedTracker):
+    """The true ball with noise, or as two cameras that triangulate it have it."""
 
     def __init__(self, params: TrackerParams, seed: int, hidden: HiddenErrors = NOTHING_HIDDEN) -> None:
-        self._params, self._hidden, self._random = params, hidden, np.random.default_rng(seed)
-        self._waiting: deque[tuple[float, bytes]] = deque()
-        self._sequence = 0
-        pair = params.cameras
+        super().__init__(params, seed)
+        self._hidden, pair = hidden, params.cameras
         if not isinstance(pair, CameraParams):
             raise ValueError(
                 "tracker.cameras: expected triangulated cameras in real time, got 'rendered'; it is for lock-step"
             )
         self._cameras = CameraPair(pair, params.rate, self._random) if pair.triangulated else None
-        self._silent_until = -np.inf
-
-    def drop_out(self, until: float) -> None:
-        """Sends nothing until then."""
-        self._silent_until = until
 
     def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
         """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
@@ -103,14 +113,4 @@ class TrackerEmulator:
         if position is not None:
             noise = 0.0 if self._cameras else params.noise * self._random.normal(size=3)
             position = self._hidden.seen(position) + noise + np.array(params.offset)
-        if now >= self._silent_until:
-            frame = BallSample(self._sequence, ball, self._hidden.stamped(now), position)
-            self._waiting.append((now + params.latency, encode(frame)))
-        self._sequence += 1
-
-    def due(self, now: float) -> list[bytes]:
-        """Datagrams that are ready to be sent."""
-        ready = []
-        while self._waiting and self._waiting[0][0] <= now + 1e-9:
-            ready.append(self._waiting.popleft()[1])
-        return ready
+        self._send(now, ball, self._hidden.stamped(now), position)

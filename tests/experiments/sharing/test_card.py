@@ -7,7 +7,7 @@ import math
 import pytest
 
 from experiments.errors import RunError
-from experiments.options import SHIPPED_POLICY
+from experiments.runs.locate import SHIPPED
 from experiments.sharing import card
 from robot_io.policy import artefact as artefacts
 
@@ -21,7 +21,7 @@ def wilson(k: int, n: int) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def artefact():
-    return artefacts.load(SHIPPED_POLICY)
+    return artefacts.load(SHIPPED / "quickstart")
 
 
 def write(artefact, evaluation) -> str:

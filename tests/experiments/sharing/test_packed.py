@@ -20,9 +20,8 @@ from experiments import cli
 from experiments.commands.evaluate import default_folder
 from experiments.config.experiment import parse
 from experiments.errors import RunError
-from experiments.options import SHIPPED_POLICY
 from experiments.runs import load_policy
-from experiments.runs.locate import artefact_of
+from experiments.runs.locate import SHIPPED, artefact_of
 from experiments.sharing import packed
 from experiments.sharing.packed import MEMBERS, SUMS, PackError, pack, read, unpack, zipped
 from robot_io.policy import artefact as artefacts
@@ -32,8 +31,8 @@ from robot_io.policy import artefact as artefacts
 def run(tmp_path_factory):
     """A run as training leaves it, but for its checkpoints and pictures: of the policy that comes with the program."""
     folder = tmp_path_factory.mktemp("runs") / "anna"
-    shutil.copytree(SHIPPED_POLICY, folder / "artefact")
-    provenance = json.loads((SHIPPED_POLICY / "manifest.json").read_text())["provenance"]
+    shutil.copytree(SHIPPED / "quickstart", folder / "artefact")
+    provenance = json.loads((SHIPPED / "quickstart" / "manifest.json").read_text())["provenance"]
     (folder / "config.yaml").write_text(yaml.safe_dump(provenance["config"]))
     (folder / "evaluation.json").write_text(json.dumps(provenance["evaluation"]))
     return folder

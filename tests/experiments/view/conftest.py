@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from ballmodel import registry
-from experiments.options import SHIPPED_POLICY
 from experiments.runs import load_policy
+from experiments.runs.locate import SHIPPED
 from experiments.view.playlist import PolicyPlaylist
 from experiments.view.recorder import Recorder
 from mjx_tt.env.task import TaskConfig
@@ -20,7 +20,7 @@ def recorder():
 
 @pytest.fixture(scope="package")
 def policy():
-    return load_policy.load(SHIPPED_POLICY).policy
+    return load_policy.load(SHIPPED / "quickstart").policy
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 from experiments import cli
 from experiments.commands import view
 from experiments.errors import ConfigError
-from experiments.options import SHIPPED_POLICY
+from experiments.runs.locate import SHIPPED
 from experiments.view import auth
 
 TOKEN = "a-token-of-its-own"
@@ -148,7 +148,7 @@ def test_a_viser_that_starts_its_server_in_another_way_is_refused_and_its_tunnel
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys, monkeypatch):
-    policy = str(SHIPPED_POLICY)
+    policy = str(SHIPPED / "quickstart")
     for arguments, words in (
         (["nowhere"], "neither a run"),
         ([policy] * 5, "4 are the most"),

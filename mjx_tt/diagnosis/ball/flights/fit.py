@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -45,7 +46,7 @@ def fit_starts(
     prior: distribution of the spins; without it the balls do not spin (or keep the spin given).
     keep: (T, n) samples that count, all by default.
     """
-    return fit_with_cost(problem, theta, start, g, noise, prior, rounds, keep)[0]
+    return fit_flights(problem, theta, start, g, noise, prior, rounds, keep).start
 
 
 def log_evidence(
@@ -62,12 +63,22 @@ def log_evidence(
     Spin and kick are integrated out by Laplace's approximation. The best fit alone would do without the determinant,
     and prefer what makes spins show more, such as a larger lift: the same flights by smaller spins.
     """
-    best, cost, normal, known = _fitted(problem, theta, start, g, noise, prior, rounds, None)
-    spread = np.linalg.slogdet(normal)[1] - np.linalg.slogdet(normal[:, :6, :6])[1]
-    return best, cost + spread - np.linalg.slogdet(known[:, 6:, 6:])[1]
+    f = fit_flights(problem, theta, start, g, noise, prior, rounds)
+    spread = np.linalg.slogdet(f.information)[1] - np.linalg.slogdet(f.information[:, :6, :6])[1]
+    return f.start, f.cost + spread - np.linalg.slogdet(f.known[:, 6:, 6:])[1]
 
 
-def fit_with_cost(
+class Fit(NamedTuple):
+    """Fits of n balls' own unknowns."""
+
+    start: np.ndarray  # (12, n)
+    cost: np.ndarray  # (n,) whitened squares, and the prior's pull
+    active: list[int]  # the a rows of ``start`` that were fitted
+    information: np.ndarray  # (n, a, a) about these, with what was known before
+    known: np.ndarray  # (n, a, a) of that, what was known before
+
+
+def fit_flights(
     problem: BallProblem,
     theta: np.ndarray,
     start: np.ndarray,
@@ -76,41 +87,13 @@ def fit_with_cost(
     prior: SpinPrior | None = None,
     rounds: int = 4,
     keep: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Starts (12, n) as of ``fit_starts``, and the cost (n,) of each ball's fit: whitened squares, the prior's pull."""
-    return _fitted(problem, theta, start, g, noise, prior, rounds, keep)[:2]
-
-
-def fit_with_information(
-    problem: BallProblem,
-    theta: np.ndarray,
-    start: np.ndarray,
-    g: Grid,
-    noise: Noise,
-    prior: SpinPrior | None,
-    rounds: int = 8,
-) -> tuple[np.ndarray, list[int], np.ndarray]:
-    """Starts (12, n) as of ``fit_starts``, the a rows that were fitted, and information (n, a, a) about these."""
-    best, _, normal, _ = _fitted(problem, theta, start, g, noise, prior, rounds, None)
-    return best, _active(noise, prior), normal
-
-
-def _fitted(
-    problem: BallProblem,
-    theta: np.ndarray,
-    start: np.ndarray,
-    g: Grid,
-    noise: Noise | None,
-    prior: SpinPrior | None,
-    rounds: int,
-    keep: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Starts, costs, and information (n, a, a) about each ball's own unknowns: with what was known before, and that."""
+) -> Fit:
+    """Fits of all balls; arguments as of ``fit_starts``."""
     noise = nominal_noise(g) if noise is None else noise
     mask = g.mask if keep is None else g.mask & keep
     g = replace(g, mask=mask)
     whitening = Whitening(noise, g)
-    active = _active(noise, prior)
+    active = [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
     size = len(active)
     damping = np.full(g.n, LEAST_DAMPING)
     theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
@@ -156,12 +139,7 @@ def _fitted(
         change = np.linalg.solve(damped + 1e-12 * np.eye(size), (right / scale)[..., None])[..., 0] / scale
         start = best.copy()
         start[active] += change.T
-    return best, best_cost, normal, precision[:, active][:, :, active]
-
-
-def _active(noise: Noise, prior: SpinPrior | None) -> list[int]:
-    """Rows of a start that a fit has free."""
-    return [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
+    return Fit(best, best_cost, active, normal, precision[:, active][:, :, active])
 
 
 def fit_spins(
@@ -187,7 +165,7 @@ def fit_spins(
     tiled = None
     if noise is not None:
         tiled = replace(noise, frame=np.tile(noise.frame, count), scale=np.tile(noise.scale, count))
-    fitted, cost = fit_with_cost(tried, changes, begin, many, tiled, prior, rounds=8)
+    fitted, cost, *_ = fit_flights(tried, changes, begin, many, tiled, prior, rounds=8)
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf).reshape(count, g.n), axis=0)
     return fitted.reshape(12, count, g.n)[:, best, np.arange(g.n)]
 
@@ -199,7 +177,7 @@ def refit_worst(
 
     A ball whose fit ended in the wrong valley would look like one that flies unlike the others.
     """
-    cost = fit_with_cost(problem, theta, start, g, noise, prior, rounds=0)[1]
+    cost = fit_flights(problem, theta, start, g, noise, prior, rounds=0).cost
     per_sample = cost / np.maximum(g.mask.sum(axis=0), 1)
     worst = np.flatnonzero(per_sample > WORST * np.median(per_sample))
     if not worst.size:
@@ -208,7 +186,7 @@ def refit_worst(
     few = some.grid
     own = replace(noise, frame=noise.frame[..., worst], scale=noise.scale[:, worst])
     again = fit_spins(some, theta, start[:, worst], few, own, prior.of_some(worst), OTHER_SPINS)
-    again, new = fit_with_cost(some, theta, again, few, own, prior.of_some(worst), rounds=4)
+    again, new, *_ = fit_flights(some, theta, again, few, own, prior.of_some(worst))
     out = start.copy()
     out[:, worst] = np.where(new < cost[worst], again, start[:, worst])
     return out
