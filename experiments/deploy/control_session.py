@@ -10,8 +10,9 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rich.console import Console
 
@@ -34,6 +35,7 @@ READY_TIME = 60.0  # [s] for the control process to start
 PREPARE_TIME = 40.0  # [s] for the axes to home and the arm to report
 RESET_TIME = 5.0  # [s]
 SETTLE = 1.0  # [s] for the robot to come to rest after a fault
+Wanted = TypeVar("Wanted", messages.Ready, messages.Ended)
 RECOVERIES = 3  # times in a row that the rig is brought back after a fault before it counts as broken
 
 
@@ -47,7 +49,7 @@ class ControlSession:
         self.robot, self.options, self.console = robot, options, console
         self.process, self.pipe = process.start(robot, options)
         try:
-            self.report = process.wait_for(self.pipe, messages.Ready, READY_TIME).report
+            self.report = _wait_for(self.pipe, messages.Ready, READY_TIME).report
         except (RefusedError, TimeoutError, EOFError) as error:
             self.process.join(2.0)
             self.process.kill()
@@ -60,7 +62,8 @@ class ControlSession:
     @property
     def log_file(self) -> Path | None:
         """The MCAP log that the control process writes."""
-        return process.log_path(self.options)
+        options = self.options
+        return None if options.log_folder is None else Path(options.log_folder) / f"{options.log_name}.mcap"
 
     def __enter__(self) -> ControlSession:
         return self
@@ -224,7 +227,7 @@ class ControlSession:
         if self.process.is_alive():
             self.send(messages.Quit())
             try:
-                self.timings = process.wait_for(self.pipe, messages.Ended, 10.0).timings
+                self.timings = _wait_for(self.pipe, messages.Ended, 10.0).timings
             except (RefusedError, TimeoutError, EOFError, OSError):
                 pass
         self.process.join(10.0)
@@ -296,3 +299,15 @@ def open_session(
         for line in session.report:
             console.print(f"  {line}")
         yield session, rig
+
+
+def _wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:
+    """The next message of that kind; others are dropped. Raises RefusedError for ``Failed``, TimeoutError."""
+    end = time.monotonic() + seconds
+    while pipe.poll(max(end - time.monotonic(), 0.0)):
+        message = pipe.recv()
+        if isinstance(message, kind):
+            return message
+        if isinstance(message, messages.Failed):
+            raise RefusedError(message.sentence)
+    raise TimeoutError(f"the control process sent no {kind.__name__} within {seconds:g} s")

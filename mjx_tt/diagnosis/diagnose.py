@@ -34,7 +34,7 @@ from mjx_tt.sim.model import ModelFile, SimModel
 SPINS = ("auto", "none", "free")
 # Unseen balls must be predicted better with spins, by so many standard errors or to this part of the error without.
 SPINS_SURE, SPINS_PAY = 2.5, 0.8
-SPINS_LEAD = 0.6  # of the error without, below which spins are a cause though something stays unexplained
+SPINS_LEAD = 0.5  # of the root mean square without, below which spins are a cause though something stays unexplained
 
 
 @dataclass(frozen=True)
@@ -154,5 +154,7 @@ def _of_balls(
     gain = np.log(prediction.after / of_spun.after)
     gain = gain[np.isfinite(gain)]
     pays = gain.mean() > SPINS_SURE * gain.std() / np.sqrt(max(gain.size, 1)) or with_spins < SPINS_PAY * plain
-    chosen = pays and (not spun.unexplained or with_spins < SPINS_LEAD * plain)
+    # A median hides the balls that met what is no spin.
+    squares = [np.nanmean(p.after**2) for p in (of_spun, prediction)]
+    chosen = pays and (not spun.unexplained or squares[0] < SPINS_LEAD**2 * squares[1])
     return (spun, of_spun, [note]) if chosen else (found, prediction, [note])

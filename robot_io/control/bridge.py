@@ -25,6 +25,7 @@ import numpy as np
 
 from robot_io.control.commissioning import jog
 from robot_io.control.commissioning.homing import HomingGuard
+from robot_io.control.commissioning.mute import Mute
 from robot_io.control.commissioning.way_home import WayHome
 from robot_io.control.episode import STOPPED, Episode, EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY, Axes, action_of
@@ -49,7 +50,6 @@ from robot_io.safety.gate import GateState, SafetyGate, Sent
 CLOCK_EVERY = 10  # seconds of frames between two reports of the tracker's clock
 AT_HOME = 0.02  # [m], [rad] of every joint
 TRACED = 300  # ticks
-LONGEST_MUTE = 2.0  # [s]
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
 
 
@@ -103,8 +103,7 @@ class Bridge:
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
         self._stopping_since, self.stopped_because = -math.inf, ""  # the reason of a stop that no operator asked for
-        self._pulled, self._mute_began, self._mute_end = False, math.inf, -math.inf
-        self.muted: float | None = None  # [s] without answers after which EGM had ended, when it was tried last
+        self._pulled, self.mute = False, Mute(arm)
         self.trace: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=TRACED)
         self._been_home, self.paused = False, config.jog  # at the home pose since it was armed
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
@@ -180,21 +179,6 @@ class Bridge:
         self._way_home.speed, self._pulled = share * self._policy_limit, pulled
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
 
-    def mute(self, now: float, seconds: float) -> None:
-        """Leave the arm's controller without answers until its EGM has ended. Raises RefusedError unless disarmed."""
-        if not self.config.jog or self.state is not BridgeState.DISARMED or self.arm_session.problem(now):
-            raise RefusedError("not muted: only at rest, disarmed and with EGM running, in mjx-tt robot commission")
-        self.muted, self._mute_began, self._mute_end = None, now, now + min(seconds, LONGEST_MUTE)
-
-    def muting(self, now: float) -> bool:
-        """True while the arm's controller gets no answers."""
-        feedback = self.arm_session.feedback
-        if self.muted is None and now >= self._mute_began and feedback is not None:
-            gone = now - feedback.received > self.arm_session.config.timeout
-            if gone or not feedback.egm_running:
-                self.muted = feedback.received - self._mute_began
-        return self.muted is None and self._mute_began <= now < self._mute_end
-
     def stop(self, now: float, because: str = "") -> None:
         """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that search a zero stop."""
         self.stopped_because = because or self.stopped_because
@@ -251,7 +235,7 @@ class Bridge:
     def arm_received(self, now: float) -> bytes | None:
         """Answer the packet that the EGM session has just taken; None when there is nothing to answer."""
         feedback = self.arm_session.feedback
-        if feedback is None or self.muting(now):
+        if feedback is None or self.mute.active(now):
             return None
         hold = feedback.position, np.zeros_like(feedback.position)
         with self._guarded(now):

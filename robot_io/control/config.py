@@ -114,6 +114,8 @@ class RobotConfig:
                 ipaddress.IPv4Address(value)
             except ValueError:
                 raise ValueError(f"{path}: expected an IPv4 address such as 192.168.125.1, got {value!r}") from None
+        if self.arm.host == "0.0.0.0":
+            raise ValueError("arm.host: expected this computer's address on the arm's network, got every interface")
 
     @classmethod
     def of(cls, contract: Contract) -> RobotConfig:

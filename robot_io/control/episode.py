@@ -26,7 +26,7 @@ from robot_io.control.kinks import (
     slope,
 )
 from robot_io.control.strokes import COMING, GAP, LEAVING
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 from robot_io.safety.faults import NOT_THE_POLICYS
 
 REACH = 0.35  # [m] between ball and blade when the ball turns round, else it did not touch the blade

@@ -12,7 +12,7 @@ from robot_io.contract import LIMITS, JointLimits
 from robot_io.control.episode import Episode, EpisodeSummary
 from robot_io.control.rally import Box, RallyCounter, RallyCounts, RallySummary
 from robot_io.control.strokes import Seen, Strokes, in_play
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 from robot_io.log.messages import Event, Level, Record, episode_end, episode_start, json_text
 
 MAX_STEPS = 200  # control ticks of an episode, as in training
@@ -47,7 +47,7 @@ class Play:
         box: Box | None = None,
         limits: JointLimits = LIMITS,
     ) -> None:
-        self._log, self._on_episode, self._on_rally = log, on_episode, on_rally
+        self._log, self.on_episode, self.on_rally = log, on_episode, on_rally
         self._rallies = RallyCounter(self._rally_over, box)
         self.strokes = Strokes()
         self.counts = Counts(rallies=self._rallies.counts)
@@ -167,16 +167,16 @@ class Play:
         details = {k: v for k, v in asdict(summary).items() if k not in ("number", "outcome", "observed")}
         self._log(episode_end(now, summary.number, summary.outcome, {}, **details))
         try:
-            if self._on_episode is not None:
-                self._on_episode(summary)
+            if self.on_episode is not None:
+                self.on_episode(summary)
         finally:
             self._tracks.pop(summary.number, None)
             self._rallies.played(summary)
 
     def _rally_over(self, summary: RallySummary) -> None:
         self._log(Event(self._now, Level.INFO, "rally", json_text(asdict(summary))))
-        if self._on_rally is not None:
-            self._on_rally(summary)
+        if self.on_rally is not None:
+            self.on_rally(summary)
 
 
 def _stroke(now: float, strokes: Strokes) -> Event:

@@ -11,12 +11,9 @@ import multiprocessing
 import select
 import signal
 import time
-from collections import deque
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -26,36 +23,24 @@ from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
 from robot_io.control.commissioning.dry import DryArm, DryAxes
-from robot_io.control.commissioning.homing import prepare
-from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import RobotConfig, linear_axes
-from robot_io.control.episode import EpisodeSummary
-from robot_io.control.interfaces import BridgeState
 from robot_io.control.interfaces import ControlOptions as ControlOptions
+from robot_io.control.owner import Owner
 from robot_io.control.timings import Timings
-from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
+from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
-from robot_io.devices.tracker import Tracker, TrackerSocket
-from robot_io.errors import RefusedError, format_error
+from robot_io.devices.tracker import Tracker
+from robot_io.devices.udp import UdpSocket
+from robot_io.errors import format_error
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.backends import choose, make_policy
 from robot_io.policy.policy import Policy
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyGate
-from robot_io.safety.owner_watch import OwnerWatch
 
-STATUS_PERIOD = 0.2  # [s]
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
 AFTER_REST = 0.05  # [s] in which the arm is told to hold the place where it stands
-Wanted = TypeVar("Wanted", messages.Ready, messages.Ended)
-
-
-class Closable(Protocol):
-    def close(self) -> object: ...
-
-
-Closing = TypeVar("Closing", bound=Closable)
 
 
 def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
@@ -85,25 +70,25 @@ class Control:
     """Sockets, thread and recorder around a ``Bridge``; use as a context manager."""
 
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
-        self._config, self._options, self._pipe = config, options, pipe
+        self._config, self._options = config, options
         arm, found = config.arm, config.calibration.robot
-        self._contract = contract = options.contract  # not the policy's: it must not bring the limits that guard it
+        contract = options.contract  # not the policy's: it must not bring the limits that guard it
         loaded = None if options.artefact is None else artefacts.load(options.artefact, contract)
         config.check_joints(contract)
         if loaded is None:
             seen = contract.n_observation
             chosen = Policy(np.zeros(n_parameters(contract.n_joints)), np.zeros(seen), np.ones(seen))
-            self._backend, self._computed = "numpy", "no policy given: at play the robot stands still"
+            backend, self._computed = "numpy", "no policy given: at play the robot stands still"
         else:
             chosen = loaded.policy
-            self._backend, self._computed = choose(options.backend, chosen, contract)
-        policy = make_policy(self._backend, chosen, contract)
+            backend, self._computed = choose(options.backend, chosen, contract)
+        policy = make_policy(backend, chosen, contract)
         self.timings = Timings()
-        self._opened: list[Closable] = []
-        self._unsent: deque[messages.Message] = deque()
+        self._opened = ExitStack()  # closed in the opposite order, so that the axes stop before the log ends
         try:
-            self._arm_socket = self._open(EgmSocket(arm.host, arm.port))
-            self._tracker_socket = self._open(TrackerSocket(config.tracker))
+            opened = self._opened.enter_context
+            self._arm_socket = opened(UdpSocket(arm.host, arm.port, "arm"))
+            self._tracker_socket = opened(UdpSocket(config.tracker.host, config.tracker.port, "tracker"))
             recorder: log.SessionRecorder = log.NullRecorder()
             if options.log_folder is not None:
                 metadata = {
@@ -119,7 +104,7 @@ class Control:
                     dict(options.attachments),
                     contract,
                 )
-            self._recorder = self._open(recorder)
+            self._recorder = opened(closing(recorder))
             geometry = RobotGeometry.of(contract).moved(found.base)
             gate = SafetyGate(contract.limits, geometry=geometry, config=config.safety)
             zeros = found.zeros(len(contract.arm))
@@ -133,8 +118,7 @@ class Control:
                 if options.dry
                 else None
             )
-            self._axes = self._open(axes or AxesThread(linear_axes(config, contract)))
-            self._tracker = Tracker(config.tracker, config.calibration)
+            self._axes = opened(closing(axes or AxesThread(linear_axes(config, contract))))
             beyond = config.axes_motion.overtravel
             play = BridgeConfig(
                 config.delays,
@@ -145,46 +129,20 @@ class Control:
                 contract=contract,
                 balls_needed=0 if options.dry else options.balls_needed,
             )
-            self.bridge = Bridge(
-                self._session,
-                self._axes,
-                self._tracker,
-                gate,
-                policy,
-                play,
-                recorder,
-                self._episode,
-                lambda summary: self._send(messages.RallyOver(summary)),
-            )
+            tracker = Tracker(config.tracker, config.calibration)
+            self.bridge = Bridge(self._session, self._axes, tracker, gate, policy, play, recorder)
+            self.owner = Owner(pipe, self.bridge, self._axes, lambda chosen: make_policy(backend, chosen, contract))
             self._warm_up(policy, gate)
         except BaseException:
-            self._close()
+            self._opened.close()
             raise
-        self._quit, self._owner = False, OwnerWatch()
-        self._status_at = 0.0
-        self._muting = False
         self._period = 1.0 / config.rate
-
-    def _open(self, thing: Closing) -> Closing:
-        self._opened.append(thing)
-        return thing
 
     def __enter__(self) -> Control:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        """Close everything in the opposite order, so that the axes stop before the log ends; raise the first error."""
-        errors = []
-        while self._opened:
-            try:
-                self._opened.pop().close()
-            except Exception as error:  # the others must be closed all the same
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        self._opened.close()
 
     @staticmethod
     def _warm_up(policy: StepPolicy, gate: SafetyGate) -> None:
@@ -200,7 +158,7 @@ class Control:
         self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
         if self._options.dry:
             self._take_axes()  # known at once
-        self._pipe.send(messages.Ready([*report, self._computed]))
+        self.owner.pipe.send(messages.Ready([*report, self._computed]))
         self.bridge.event(time.monotonic(), log.Level.INFO, "policy", self._computed)
         while any(self._tracker_socket.drain()):
             pass  # frames that waited while this process started would be taken for those of a slow clock
@@ -208,16 +166,15 @@ class Control:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
             self._bring_to_rest(error)
-            self._send(messages.Failed(format_error(error)))
+            self.owner.tell(messages.Failed(format_error(error)))
             raise
         finally:
-            self._send(messages.Ended(self.timings.summary()))
-            while self._unsent and self._flush():
-                pass
+            self.owner.tell(messages.Ended(self.timings.summary()))
+            self.owner.flush()
 
     def quit(self) -> None:
         """Stop the robot and end the loop when it stands; from a signal handler too."""
-        self._quit = True
+        self.owner.quits = True
 
     def _bring_to_rest(self, error: BaseException) -> None:
         """Brake through the gate and answer the arm until the robot stands, with as little of the loop as possible.
@@ -248,21 +205,21 @@ class Control:
 
     def _loop(self) -> None:
         spin, bridge = self._config.realtime.spin, self.bridge
-        arm, tracker, pipe = self._arm_socket.fileno(), self._tracker_socket.fileno(), self._pipe.fileno()
+        arm, tracker, pipe = self._arm_socket.fileno(), self._tracker_socket.fileno(), self.owner.pipe.fileno()
         deadline = time.monotonic() + self._period
         end: float | None = None
         while True:
             now = time.monotonic()
-            watched = [arm, tracker] if self._quit else [arm, tracker, pipe]
+            watched = [arm, tracker] if self.owner.quits else [arm, tracker, pipe]
             ready, _, _ = select.select(watched, [], [], max(deadline - now - spin, 0.0))
             if arm in ready:
                 self._answer_arm()
             if tracker in ready:
                 now = time.monotonic()
-                for datagram, source, port in self._tracker_socket.drain():
-                    bridge.tracker_received(datagram, source, now, port)
+                for datagram, (host, port) in self._tracker_socket.drain():
+                    bridge.tracker_received(datagram, host, now, port)
             if pipe in ready:
-                self._listen()
+                self.owner.listen(time.monotonic())
             now = time.monotonic()
             if now < deadline - spin:
                 continue
@@ -275,7 +232,7 @@ class Control:
                 self.timings.missed += missed
                 deadline += missed * self._period
                 self.bridge.event(now, log.Level.WARNING, "ticks_missed", json.dumps({"missed": missed}))
-            if self._quit:
+            if self.owner.quits:
                 if end is None:
                     end = now + STOP_TIME
                     bridge.stop(now)
@@ -286,7 +243,8 @@ class Control:
 
     def _answer_arm(self) -> None:
         began = time.monotonic()
-        if self._arm_socket.drain(self._session, began):
+        # Everything that waits is read and only the newest is answered: an arm takes one message a cycle.
+        if any([self._session.receive(*packet, began) for packet in self._arm_socket.drain()]):
             reply = self.bridge.arm_received(began)
             endpoint = self._session.endpoint
             if reply is not None and endpoint is not None:
@@ -305,111 +263,15 @@ class Control:
             self.bridge.axes_received(state.position, state.received)
 
     def _tick(self, deadline: float, now: float) -> None:
-        silent = self._owner.ticked(now)
-        if silent and (self.bridge.state in (BridgeState.READY, BridgeState.ACTIVE) or self._axes.homing):
-            self.bridge.stop(now, silent)
+        self.owner.watch(now)
         self._take_axes()
         self.bridge.tick(deadline, now)
-        if self._muting and not self.bridge.muting(now):
-            self._muting = False
-            self._send(messages.Muted(self.bridge.muted))
         self.timings.lateness.add(now - deadline)
         if self.bridge.policy_seconds:
             self.timings.policy.add(self.bridge.policy_seconds)
         self.timings.tick.add(time.monotonic() - now)
-        if now >= self._status_at:
-            self._status_at = now + STATUS_PERIOD
-            if not self._unsent:
-                self._unsent.append(self.status(now))
-        if self._unsent:
-            self._flush()
-
-    # The owner
-
-    def _listen(self) -> None:
-        """Take the owner's messages; a pipe that ends means stop."""
-        try:
-            while not self._quit and self._pipe.poll():
-                self._obey(self._pipe.recv())
-        except (EOFError, OSError):
-            self._quit = True
-
-    def _obey(self, request: messages.Request) -> None:
-        now = time.monotonic()
-        self._owner.heard()
-        try:
-            match request:
-                case messages.Beat(absence):
-                    may = self.bridge.paused and not self._options.jog and not self._axes.homing
-                    self._owner.heard(absence if may else 0.0)
-                case messages.Arm():
-                    self.bridge.arm(now)
-                case messages.Prepare():
-                    prepare(self._axes, lambda: self.bridge.check_homing(now))
-                case messages.Stop():
-                    self.bridge.stop(now)
-                case messages.Reset():
-                    self.bridge.reset(now)
-                case messages.Discard():
-                    self._send(messages.Discarded(self.bridge.discard(now)))
-                case messages.Jog(step, share, pulled):
-                    self.bridge.jog(np.array(step), share, pulled)
-                case messages.Trace():
-                    self._send(messages.Traced(*map(np.array, zip(*self.bridge.trace, strict=True))))
-                case messages.Mute(seconds):
-                    self.bridge.mute(now, seconds)
-                    self._muting = True
-                case messages.Mark():
-                    seen = self._tracker.track, self.bridge.feedback.axes, self.bridge.feedback.arm
-                    self._send(messages.Marked(*(Stay.of(history, now) for history in seen)))
-                case messages.Pause(on):
-                    self.bridge.paused = on or self._options.jog
-                case messages.SetPolicy(policy, version):
-                    self.bridge.check_exchange()  # before a policy is built, which takes its time
-                    self.bridge.set_policy(make_policy(self._backend, policy, self._contract), version)
-                    self._send(messages.PolicySet(version))
-                case messages.Quit():
-                    self._quit = True
-                case _:
-                    raise RefusedError(f"unknown request {request!r}")
-        except RefusedError as error:
-            self._send(messages.Refused(request, error))
-        except Exception as error:  # a request that cannot be carried out must not end the play
-            self._send(messages.Refused(request, RefusedError(f"{type(request).__name__}: {format_error(error)}")))
-
-    def _episode(self, summary: EpisodeSummary) -> None:
-        self._send(messages.Played(summary, self.bridge.play.track(summary.number)))
-
-    def _send(self, message: messages.Message) -> None:
-        self._unsent.append(message)
-
-    def _flush(self) -> bool:
-        """Sends what fits without waiting; False when the pipe is full or gone."""
-        try:
-            while self._unsent and select.select([], [self._pipe], [], 0.0)[1]:
-                self._pipe.send(self._unsent.popleft())
-            return not self._unsent
-        except (OSError, ValueError):
-            self._unsent.clear()
-            return False
+        self.owner.report(now, self.status)
 
     def status(self, now: float) -> messages.Status:
         """State of everything at ``now``."""
         return messages.Status.of(self.bridge, self._axes, self.timings, self._recorder.dropped, now, self._options.dry)
-
-
-def wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:
-    """The next message of that kind; others are dropped. Raises RefusedError for ``Failed``, TimeoutError."""
-    end = time.monotonic() + seconds
-    while pipe.poll(max(end - time.monotonic(), 0.0)):
-        message = pipe.recv()
-        if isinstance(message, kind):
-            return message
-        if isinstance(message, messages.Failed):
-            raise RefusedError(message.sentence)
-    raise TimeoutError(f"the control process sent no {kind.__name__} within {seconds:g} s")
-
-
-def log_path(options: ControlOptions) -> Path | None:
-    """The log of a session with these options, where it is finished."""
-    return None if options.log_folder is None else Path(options.log_folder) / f"{options.log_name}.mcap"

@@ -17,7 +17,7 @@ from ballmodel.constants import TABLE_LENGTH
 from robot_io.control.episode import MISSED, RETURNED, EpisodeSummary
 from robot_io.control.kinks import SIDE, bounce_place, find_kink
 from robot_io.control.kinks import Seen as Place
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 from robot_io.rally_ends import BY_ROBOT, FILTERED, TEXTS, End, Evidence
 
 ANSWER_TIME = 1.5  # [s] after a return's bounce within which it is answered, if it is

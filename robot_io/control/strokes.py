@@ -14,7 +14,7 @@ import numpy as np
 
 from ballmodel.constants import GRAVITY
 from robot_io.control.kinks import flown
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 from robot_io.history import History
 
 COMING = -1.0  # [m/s] along y: a ball that comes towards the robot at least this fast is in play

@@ -14,7 +14,7 @@ import numpy as np
 
 from ballmodel.constants import BALL_RADIUS, GRAVITY, TABLE_HEIGHT
 from ballmodel.table_frame import Signs, acceleration, describe_fall
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 
 NEEDED = 3  # balls that bounce where they must before the robot is armed
 KEPT = 8  # balls that count

@@ -28,7 +28,7 @@ from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
 from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
-from robot_io.safety.ways import Silence, between, leads
+from robot_io.safety.ways import Silence, between, delayed, leads
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
@@ -440,10 +440,12 @@ class SafetyGate:
         and all that comes after this period is shifted by it. And where none comes any more, nothing is touched."""
         late = way.copy()
         late[:, 1:] += (self.config.late - self.period) * velocity[:, None]
-        ways = between(way, late)
+        ways, now = between(way, late), self._last or 0.0
+        past = self._monitor.past(now, float(self._leads.max()) + self.period)
+        true = delayed(way, late, past, now, self.period, self.config.late, self._leads)
         if self.geometry.first_too_close(ways, self._margin, SLACK) is not None:
             return False
-        if self.geometry.first_too_close(self._true_ways(way, late), self._touch, SLACK) is not None:
+        if self.geometry.first_too_close(true, self._touch, SLACK) is not None:
             return False
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             if self.geometry.first_too_close(ways + self._deviation[:, None], self._touch, SLACK) is not None:
@@ -458,21 +460,6 @@ class SafetyGate:
             gaps = self.geometry.gaps(way)[self._inside]
             return bool((gaps[:, -1] > gaps[:, 0]).all())
         return True
-
-    def _true_ways(self, way: np.ndarray, late: np.ndarray) -> np.ndarray:
-        """Where the robot itself goes, (8, M), while its drives follow two ways (8, N) of references with their delays:
-        along the first way and back along the second, with the delays as far apart as they may be, either way."""
-        now, period = self._last or 0.0, self.period
-        before, passed = self._monitor.past(now, float(self._leads.max()) + period)
-        braking = period * np.arange(way.shape[1] - 1)
-        ways = []
-        for lead in self._leads:
-            for gap, references in ((period, way), (self.config.late, late)):
-                times = np.concatenate([before, [now], now + gap + braking])
-                values = np.concatenate([passed, references], axis=1)
-                there = np.array([np.interp(times + a, times, row) for a, row in zip(lead, values, strict=True)])
-                ways.append(there if references is way else there[:, ::-1])
-        return np.concatenate(ways, axis=1)
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""
@@ -518,16 +505,8 @@ class SafetyGate:
 
     def _request(self, request: ArrayLike, now: float) -> np.ndarray:
         """The requested velocity (8,), zero when it cannot be used."""
-        values, problem = numbers_of(self.geometry.joints, request, "requested velocity")
+        values, problem = numbers_of(self.geometry.joints, request, "requested velocity", normal=True)
         finite = values is None or bool(np.isfinite(values).all())
-        if not problem and values is not None:
-            kind = np.asarray(request).dtype
-            tiny = np.finfo(kind if kind.kind == "f" else np.float64).tiny
-            # No motion is that slow: bytes that were taken for numbers often look like this.
-            subnormal = (values != 0.0) & (np.abs(values) < tiny)
-            if subnormal.any():
-                i = int(subnormal.argmax())
-                problem = f"requested velocity: {self.geometry.joints[i]} is {values[i]}, a subnormal number"
         self.condition(Cause.NON_FINITE_COMMAND, not finite, problem, now)
         self.condition(Cause.MALFORMED_COMMAND, bool(problem) and finite, problem, now)
         return np.zeros_like(self._velocity) if problem or values is None else values

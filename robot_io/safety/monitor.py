@@ -126,8 +126,13 @@ class FeedbackMonitor:
         return ""
 
 
-def numbers_of(joints: tuple[str, ...], values: ArrayLike, what: str) -> tuple[np.ndarray | None, str]:
-    """A finite float64 number for each joint, and what is wrong instead; None where they are not as many numbers."""
+def numbers_of(
+    joints: tuple[str, ...], values: ArrayLike, what: str, normal: bool = False
+) -> tuple[np.ndarray | None, str]:
+    """A finite float64 number for each joint, and what is wrong instead; None where they are not as many numbers.
+
+    normal: subnormal numbers are wrong too. No motion is that slow: bytes that were taken for numbers often look so.
+    """
     try:
         given = np.asarray(values)
     except Exception as error:  # whatever an array-like object does when it is converted
@@ -137,6 +142,9 @@ def numbers_of(joints: tuple[str, ...], values: ArrayLike, what: str) -> tuple[n
     numbers = given.astype(np.float64)
     for i in np.flatnonzero(~np.isfinite(numbers)):
         return numbers, f"{what}: {joints[i]} is {numbers[i]}"
+    tiny = np.finfo(given.dtype if given.dtype.kind == "f" else np.float64).tiny if normal else 0.0
+    for i in np.flatnonzero((numbers != 0.0) & (np.abs(numbers) < tiny)):
+        return numbers, f"{what}: {joints[i]} is {numbers[i]}, a subnormal number"
     return numbers, ""
 
 

@@ -28,6 +28,33 @@ def between(way: np.ndarray, late: np.ndarray) -> np.ndarray:
     return np.concatenate([way, late[:, -1:], rungs, way[:, :1]], axis=1)
 
 
+def delayed(
+    way: np.ndarray,
+    late: np.ndarray,
+    past: tuple[np.ndarray, np.ndarray],
+    now: float,
+    period: float,
+    latest: float,
+    leads: np.ndarray,
+) -> np.ndarray:
+    """Where the robot itself goes, (n, M), while its drives follow two ways (n, N) of references with their delays.
+
+    Along the first way and back along the second, with the delays as far apart as they may be, either way. past: times
+    (P,) and references (n, P) before ``now``. The first way's next tick comes after ``period``, the second's after
+    ``latest``.
+    """
+    before, passed = past
+    braking = period * np.arange(way.shape[1] - 1)
+    ways = []
+    for lead in leads:
+        for gap, references in ((period, way), (latest, late)):
+            times = np.concatenate([before, [now], now + gap + braking])
+            values = np.concatenate([passed, references], axis=1)
+            there = np.array([np.interp(times + a, times, row) for a, row in zip(lead, values, strict=True)])
+            ways.append(there if references is way else there[:, ::-1])
+    return np.concatenate(ways, axis=1)
+
+
 class Silence:
     """Each device goes on with its last command until its own time-out, or until the computer speaks again.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robot_io.devices.tracker import BallSample, encode
+from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.vision.health import Health
 from robot_io.vision.process import CameraProcess, Look
 from robot_io.vision.rig import CameraRig

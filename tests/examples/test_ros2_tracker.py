@@ -12,7 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from examples.tracker.ros2_tracker import Frames
 from examples.tracker.tracker_client import datagram
-from robot_io.devices.tracker import Tracker, TrackerConfig, TrackerSocket
+from robot_io.devices.tracker import Tracker, TrackerConfig
+from robot_io.devices.udp import UdpSocket
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 KIND = "geometry_msgs/msg/PointStamped"
@@ -36,14 +37,14 @@ def test_the_bridge_receives_what_the_topic_carries():
     points = [*flight, *[nowhere] * 5, *flight, *[nowhere] * 125, flight[0]]
     found, tracker = [], Tracker(TrackerConfig())
     with (
-        closing(TrackerSocket(TrackerConfig(port=0))) as receiver,
+        closing(UdpSocket("127.0.0.1", 0, "tracker")) as receiver,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         with socket.fromfd(receiver.fileno(), socket.AF_INET, socket.SOCK_DGRAM) as bound:
             to = bound.getsockname()
         for i, point in enumerate(points):
             sender.sendto(datagram(frames.frame(sent(8_000_000 * i, point))), to)
-            for got, source, port in receiver.drain():
+            for got, (source, port) in receiver.drain():
                 found.append(tracker.receive(got, source, 0.008 * i + 0.01, port))
     assert len(found) == len(points) and all(found)
     assert [sample.ball for sample in found] == [1] * 35 + [2] * 155 + [3]

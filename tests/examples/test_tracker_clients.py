@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 
 from examples.tracker.tracker_client import Frame, datagram
-from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, TrackerSocket, decode, encode
+from robot_io.devices.ball_datagram import BallSample, decode, encode
+from robot_io.devices.tracker import Tracker, TrackerConfig
+from robot_io.devices.udp import UdpSocket
 
 HOME = "127.0.0.1"
 SOURCES = Path(__file__).resolve().parents[2] / "examples" / "tracker"
@@ -154,7 +156,7 @@ def test_damaged_datagrams_are_refused():
 @pytest.mark.parametrize("language", ["python", "c"])
 def test_a_program_sends_its_ball_to_the_bridge_in_real_time(programs, language):
     command = programs(language)
-    receiver = TrackerSocket(TrackerConfig(port=0))
+    receiver = UdpSocket("127.0.0.1", 0, "tracker")
     tracker = Tracker(TrackerConfig(oldest=1.0))  # a busy machine may read late
     received: list[tuple[BallSample, float]] = []
     try:
@@ -165,7 +167,7 @@ def test_a_program_sends_its_ball_to_the_bridge_in_real_time(programs, language)
         try:
             while len(received) < FRAMES and time.monotonic() < began + 20.0:
                 select.select([receiver], [], [], 0.2)
-                for packet, source, sender in receiver.drain():
+                for packet, (source, sender) in receiver.drain():
                     now = time.monotonic()
                     sample = tracker.receive(packet, source, now, sender)
                     assert sample is not None, tracker.counts

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
+import multiprocessing
 
 import numpy as np
 
 from robot_io.control import messages
-from robot_io.control.commissioning.homing import prepare
-from robot_io.control.commissioning.mark import Stay
 from robot_io.control.interfaces import BridgeConfig
+from robot_io.control.owner import Owner
 from robot_io.control.timings import Timings
 from robot_io.emulator.arm import ArmStateError
 from robot_io.emulator.config import RigParams
-from robot_io.errors import RefusedError
 from robot_io.safety.config import SafetyConfig
 from tests.support.lockstep_play import lockstep
 
@@ -45,49 +43,27 @@ class LockStepSession:
 
     def __init__(self, params: RigParams, scale=0.1):
         self.rig = lockstep(params=params, config=BridgeConfig(jog=True), safety=SafetyConfig(speed_scale=scale))
-        self.status, self._told, self._status_at, self._muting = None, deque(), 0.0, False
+        self.status = None
+        ours, self._theirs = multiprocessing.Pipe()
+        self._owner = Owner(ours, self.rig.bridge, _Thread(self.rig.axes))
 
     def send(self, request):
-        bridge, now = self.rig.bridge, self.rig.now
-        try:
-            match request:
-                case messages.Arm():
-                    bridge.arm(now)
-                case messages.Prepare():
-                    prepare(_Thread(self.rig.axes), lambda: bridge.check_homing(now))
-                case messages.Stop():
-                    bridge.stop(now)
-                case messages.Reset():
-                    bridge.reset(now)
-                case messages.Jog(step, share, pulled):
-                    bridge.jog(np.array(step), share, pulled)
-                case messages.Mark():
-                    seen = bridge.tracker.track, bridge.feedback.axes, bridge.feedback.arm
-                    self._told.append(messages.Marked(*(Stay.of(history, now) for history in seen)))
-                case messages.Trace():
-                    self._told.append(messages.Traced(*map(np.array, zip(*bridge.trace, strict=True))))
-                case messages.Mute(seconds):
-                    bridge.mute(now, seconds)
-                    self._muting = True
-        except RefusedError as error:
-            self._told.append(messages.Refused(request, error))
+        self._owner.obey(request, self.rig.now)
 
     def messages(self, seconds):
         rig = self.rig
         end = rig.now + seconds
         while True:
-            if rig.now >= self._status_at:
-                self._status_at = rig.now + 0.2
-                self.status = messages.Status.of(rig.bridge, _Thread(rig.axes), Timings(), 0, rig.now, False)
-                self._told.append(self.status)
-            if self._muting and not rig.bridge.muting(rig.now):
-                self._muting = False
-                self._told.append(messages.Muted(rig.bridge.muted))
-            while self._told:
-                yield self._told.popleft()
+            self._owner.report(rig.now, self._status)
+            while self._theirs.poll():
+                yield self._theirs.recv()
             if rig.now >= end - 1e-9:
                 return
             rig.run(min(0.02, end - rig.now))
+
+    def _status(self, now):
+        self.status = messages.Status.of(self.rig.bridge, _Thread(self.rig.axes), Timings(), 0, now, False)
+        return self.status
 
 
 class LockStepHands:

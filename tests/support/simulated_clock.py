@@ -9,9 +9,10 @@ import numpy as np
 
 from robot_io.contract import N_JOINTS
 from robot_io.control.bridge import Bridge, BridgeConfig
+from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.devices.egm.messages import decode_sensor, encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
-from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, encode
+from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.safety.gate import SafetyGate
 
 CONTROLLER = ("127.0.0.1", 40000)

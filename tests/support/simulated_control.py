@@ -16,7 +16,7 @@ from tests.support.simulated_clock import CONTROLLER, Simulation
 
 
 class ArmSocket:
-    """Stand-in for ``EgmSocket`` in the control process."""
+    """Stand-in for the arm's socket in the control process."""
 
     def __init__(self, simulation):
         self._simulation = simulation
@@ -24,14 +24,17 @@ class ArmSocket:
     def fileno(self):
         return "arm"
 
-    def drain(self, session, now):
+    def drain(self):
         packets, self._simulation.packets = self._simulation.packets, []
-        return any([session.receive(packet, CONTROLLER, now) for packet in packets])
+        return [(packet, CONTROLLER) for packet in packets]
 
     def send(self, reply, endpoint):
         self._simulation.answered(reply)
 
-    def close(self):
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
         pass
 
 
@@ -42,7 +45,7 @@ class FrameSocket(ArmSocket):
     def drain(self):
         frames = self._simulation.frames
         while frames and frames[0][0] <= self._simulation.now:
-            yield frames.popleft()[1], "127.0.0.1", 5000
+            yield frames.popleft()[1], ("127.0.0.1", 5000)
 
 
 class Simulated:
@@ -53,10 +56,10 @@ class Simulated:
 
     def __init__(self, artefact, monkeypatch, **options):
         self.simulation = Simulation()
-        self.script, self.beats, self._beaten = [], True, 0.0
+        self.script, self.beats, self._beaten, self._told = [], True, 0.0, []
         self.pipe, theirs = multiprocessing.Pipe()
-        monkeypatch.setattr(process, "EgmSocket", lambda *_: ArmSocket(self.simulation))
-        monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
+        sockets = {"arm": ArmSocket(self.simulation), "tracker": FrameSocket(self.simulation)}
+        monkeypatch.setattr(process, "UdpSocket", lambda host, port, key: sockets[key])
         monkeypatch.setattr(process, "linear_axes", lambda *_: None)
         monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
         monkeypatch.setattr(process, "EgmConfig", partial(EgmConfig, ramp_in=0.0))  # as the simulation's arm
@@ -83,16 +86,21 @@ class Simulated:
                 self._beaten = simulation.now
                 with contextlib.suppress(OSError):  # the owner has closed its end
                     self.pipe.send(messages.Beat())
+                    self._read()
             while self.script and self.script[0][0] <= simulation.now:
                 self.script.pop(0)[1]()
         ready = ["arm"] * bool(simulation.packets) + ["tracker"] * bool(simulation.frames)
         return [f for f in read if f in ready or (isinstance(f, int) and self.pipe_waits())], [], []
 
     def pipe_waits(self):
-        return self.control._pipe.poll()
+        return self.control.owner.pipe.poll()
+
+    def _read(self):
+        while self.pipe.poll():
+            self._told.append(self.pipe.recv())
 
     def words(self):
-        found = []
-        while self.pipe.poll():
-            found.append(self.pipe.recv())
+        """What the owner was told since it was asked last."""
+        self._read()
+        found, self._told = self._told, []
         return found

@@ -1,4 +1,4 @@
-"""The computer's end of ABB EGM: ``EgmSession`` is the protocol, without socket or clock; ``EgmSocket`` a UDP socket.
+"""The computer's end of ABB EGM: the protocol, without socket or clock.
 
 The controller sends its state every 4 ms and afterwards takes ONE queued message; with none queued it goes on with the
 last one, speed included, until its own communication timeout. Hence: read everything that is queued, answer only the
@@ -8,9 +8,7 @@ newest packet, and answer it once. Nothing here can stop an arm whose computer h
 
 from __future__ import annotations
 
-import errno
 import ipaddress
-import socket
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -18,12 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robot_io.contract import ABB_JOINTS
-from robot_io.devices.egm.messages import MAX_DATAGRAM, UINT32, decode_robot, encode_sensor
+from robot_io.devices.egm.messages import UINT32, decode_robot, encode_sensor
 from robot_io.devices.egm.messages import EgmError as EgmError
 
 DEFAULT_PORT = 6510
 RECENT = 1.0  # [s] of controller time: a packet that much older or newer than the last is no neighbour of it
-MAX_DRAIN = 1000  # datagrams per call: a flood must not keep the caller from its control tick
 
 
 @dataclass(frozen=True)
@@ -273,81 +270,3 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 def _signed(difference: int) -> int:
     return (difference + UINT32 // 2) % UINT32 - UINT32 // 2
-
-
-class EgmSocket:
-    """A non-blocking UDP socket on one of this computer's addresses.
-
-    address  IPv4 address of the network that the controller is on; "0.0.0.0" (every interface) is refused unless
-             ``all_interfaces``
-    port     as in the controller's UCdevice; 0 takes a free one
-
-    Raises EgmError (reasons: interface, in_use, no_address, socket) when it cannot be opened.
-    """
-
-    def __init__(self, address: str, port: int = DEFAULT_PORT, all_interfaces: bool = False):
-        if address in ("", "0.0.0.0") and not all_interfaces:
-            raise EgmError(
-                "interface",
-                f"address {address!r} listens on every interface: give this computer's address on the arm's network",
-            )
-        self.network_errors = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        try:
-            self._socket.bind((address, port))
-        except (OSError, OverflowError) as error:
-            self._socket.close()
-            raise _bind_error(address, port, error) from error
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """(address, port) that it listens on."""
-        return self._socket.getsockname()
-
-    def fileno(self) -> int:
-        return self._socket.fileno()
-
-    def drain(self, session: EgmSession, now: float) -> bool:
-        """Feeds everything that is queued to the session; True when a packet was accepted, so that a reply is due."""
-        accepted = False
-        for _ in range(MAX_DRAIN):
-            try:
-                datagram, source = self._socket.recvfrom(MAX_DATAGRAM + 1)  # one more, so that longer ones are noticed
-            except BlockingIOError:
-                break
-            except OSError:  # a reply met a closed port, the interface is down; what is queued behind is still good
-                self.network_errors += 1
-                continue
-            accepted |= session.receive(datagram, source, now)
-        return accepted
-
-    def send(self, datagram: bytes, endpoint: tuple[str, int]) -> bool:
-        """Sends to ``EgmSession.endpoint``; False (and ``network_errors`` grows) when the network refuses it."""
-        try:
-            return self._socket.sendto(datagram, endpoint) == len(datagram)
-        except OSError:
-            self.network_errors += 1
-            return False
-
-    def close(self) -> None:
-        self._socket.close()
-
-    def __enter__(self) -> EgmSocket:
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
-
-
-def _bind_error(address: str, port: int, error: Exception) -> EgmError:
-    where, code = f"UDP {address} port {port}", getattr(error, "errno", None)
-    if code == errno.EADDRINUSE:
-        return EgmError(
-            "in_use",
-            f"{where} is in use by another program, perhaps an earlier run of this one or RobotStudio: end it "
-            "(ss -ulpn lists it), or choose another port here and in the controller's UCdevice",
-        )
-    if code == errno.EADDRNOTAVAIL:
-        return EgmError("no_address", f"{where}: this computer has no such address; ip address lists those that it has")
-    return EgmError("socket", f"{where} cannot be opened ({error}); give an IPv4 address and a port from 1024 to 65535")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeAlias, get_a
 import numpy as np
 
 from ballmodel.io.ranges import Within, check_fields
-from robot_io.devices.tracker import BallSample, encode
+from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.emulator.tracker.cameras import CameraPair, CameraParams
 from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 

@@ -25,8 +25,9 @@ from robot_io.control import messages, process
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.control.messages import Marked
+from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.devices.egm.messages import encode_robot
-from robot_io.devices.tracker import BallSample, TrackerConfig, encode
+from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.processes import HOST, free_ports
 from robot_io.history import History
 from robot_io.safety.clearance import BLADE

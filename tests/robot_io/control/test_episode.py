@@ -9,7 +9,8 @@ import pytest
 
 from robot_io.control.episode import HIT, MISSED, RETURNED, Episode
 from robot_io.control.strokes import in_play
-from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, encode
+from robot_io.devices.ball_datagram import BallSample, encode
+from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams

@@ -14,11 +14,12 @@ from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS, N_OBSERVATION
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
 from robot_io.control.observation import Feedback, ObservationDelays, joints, observe
+from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, DirectLink, FestoAxes
-from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, encode
+from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.axis_registers import AxisUnits

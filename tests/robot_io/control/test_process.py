@@ -27,12 +27,15 @@ def simulated(tmp_path, monkeypatch):
     return Simulated(tmp_path / "artefact", monkeypatch)
 
 
-@pytest.mark.parametrize("part", ["_tick", "_obey", "status", "_answer_arm", "bridge.tracker_received", "bridge.tick"])
+@pytest.mark.parametrize(
+    "part", ["_tick", "owner.obey", "status", "_answer_arm", "bridge.tracker_received", "bridge.tick"]
+)
 @pytest.mark.parametrize("error", [Escaped, ValueError, KeyboardInterrupt])
 def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, error):
     """Raised once, on the way to a home pose far away, at more than 1 rad/s."""
     control, simulation = simulated.control, simulated.simulation
-    owner, name = (control.bridge, part[7:]) if part.startswith("bridge.") else (control, part)
+    *path, name = part.split(".")
+    owner = getattr(control, path[0]) if path else control
     before = getattr(owner, name)
     moved = []
 
@@ -47,7 +50,7 @@ def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, er
 
     def spoil():
         setattr(owner, name, escape)
-        if part == "_obey":
+        if part == "owner.obey":
             simulated.pipe.send(messages.Discard())
 
     simulated.script = [(10.5, move), (10.8, spoil)]
@@ -131,7 +134,7 @@ def test_an_exception_brakes_also_where_no_fault_can_be_latched(simulated):
 
     def spoil():
         gate.fault = raising(ValueError)
-        control._obey = raising(ValueError)
+        control.owner.obey = raising(ValueError)
 
     simulated.script = [(10.5, move), (10.8, spoil)]
     with pytest.raises(ValueError, match="made up"), control:

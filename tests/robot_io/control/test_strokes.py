@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot_io.control.strokes import Seen, Strokes
-from robot_io.devices.tracker import BallSample
+from robot_io.devices.ball_datagram import BallSample
 
 DT = 0.008
 START, CONTACT = np.array([0.2, -1.0, 0.25]), 0.52  # [m] of the robot's return, [s] of the human's contact

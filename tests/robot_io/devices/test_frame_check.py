@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from robot_io.contract import LIMITS
+from robot_io.devices.ball_datagram import BallSample
 from robot_io.devices.frame_check import NEEDED, FrameCheck
-from robot_io.devices.tracker import BallSample, TrackerConfig
+from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.hidden import HiddenErrors

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import struct
 import zlib
 
@@ -10,10 +9,10 @@ import numpy as np
 import pytest
 
 from robot_io.calibrated import Calibration, TrackerCalibration
-from robot_io.devices.tracker import SIZE, BallSample, Tracker, TrackerConfig, TrackerSocket, decode, encode
+from robot_io.devices.ball_datagram import SIZE, BallSample, decode, encode
+from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.network import Network, NetworkFaults
 from robot_io.emulator.tracker import TrackerEmulator, TrackerParams
-from robot_io.errors import DeviceError
 
 HOME = "127.0.0.1"
 # Frame 0x01020304 of ball 7, captured at 1.5 s, at (0.5, -1.25, 0.25) m, written down byte by byte.
@@ -260,24 +259,6 @@ def test_cameras_are_late_noisy_and_can_fall_silent():
     np.testing.assert_allclose(error.std(axis=0), 0.003, rtol=0.05)
     gaps = np.diff([s.sequence for _, s in received])
     assert sorted(set(gaps)) == [1, 101]
-
-
-def test_the_socket_gives_what_has_arrived_and_names_a_busy_port():
-    receiver = TrackerSocket(TrackerConfig(port=0))
-    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sender.connect(receiver._socket.getsockname())
-    assert list(receiver.drain()) == []
-    for data in (golden(), b"", bytes(1000)):
-        sender.send(data)
-    assert [(data, source) for data, source, _ in receiver.drain()] == [
-        (golden(), HOME),
-        (b"", HOME),
-        (bytes(1000), HOME),
-    ]
-    with pytest.raises(DeviceError, match="cannot listen on .* tracker.port"):
-        TrackerSocket(TrackerConfig(port=receiver._socket.getsockname()[1]))
-    receiver.close()
-    sender.close()
 
 
 def flying(i, **changed):

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from robot_io.contract import ABB_JOINTS, LIMITS, N_JOINTS
-from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
+from robot_io.devices.egm.session import EgmConfig, EgmSession
+from robot_io.devices.udp import UdpSocket
 from robot_io.emulator import shared_state
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
@@ -152,13 +153,16 @@ def test_a_stopped_process_of_the_rig_is_no_fast_joint(who):
     with Rig(SCENE, throws(), RigParams(arm=ArmParams(comm_timeout=1.0))) as rig:
         session, speeds, last, stopped = EgmSession(EgmConfig()), [], None, 0
         [pid] = [process.pid for process in rig._processes.values() if process.name == who]
-        with EgmSocket(HOST, rig.robot.arm.port) as wire:
+        with UdpSocket(HOST, rig.robot.arm.port, "arm") as wire:
             rig.switch_on()
             start = None
             while start is None or time.monotonic() < start + 3.0:
                 assert select.select([wire.fileno()], [], [], 2.0)[0], "no packet of the arm's controller"
                 now = time.monotonic()
-                if not wire.drain(session, now) or not session.feedback.egm_running:
+                if (
+                    not any([session.receive(*packet, now) for packet in wire.drain()])
+                    or not session.feedback.egm_running
+                ):
                     continue
                 seen = session.feedback
                 if start is None:

@@ -131,7 +131,7 @@ def fail(*_, **__):
         "axes.command",
         "axes.stop",
         "arm_session.problem",
-        "play._on_episode",
+        "play.on_episode",
         "play.settle",
         "play.strokes.add",
         "play.moved",

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.vision import render
 from experiments.vision.pipeline import SHIPPED
-from robot_io.devices.tracker import decode
+from robot_io.devices.ball_datagram import decode
 from robot_io.vision import live, rig
 from robot_io.vision.recording import FrameWriter
 from robot_io.vision.sources import RecordedSource
