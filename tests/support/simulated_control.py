@@ -86,7 +86,6 @@ class Simulated:
                 self._beaten = simulation.now
                 with contextlib.suppress(OSError):  # the owner has closed its end
                     self.pipe.send(messages.Beat())
-                    self._read()
             while self.script and self.script[0][0] <= simulation.now:
                 self.script.pop(0)[1]()
         ready = ["arm"] * bool(simulation.packets) + ["tracker"] * bool(simulation.frames)
@@ -95,12 +94,13 @@ class Simulated:
     def pipe_waits(self):
         return self.control.owner.pipe.poll()
 
-    def _read(self):
+    def read(self):
+        """Takes what the owner was told, before the pipe is full."""
         while self.pipe.poll():
             self._told.append(self.pipe.recv())
 
     def words(self):
         """What the owner was told since it was asked last."""
-        self._read()
+        self.read()
         found, self._told = self._told, []
         return found

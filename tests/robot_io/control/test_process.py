@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
+
 import numpy as np
 import pytest
 
@@ -166,6 +168,9 @@ def test_a_silent_owner_is_a_stop_in_order_with_its_reason(tmp_path, monkeypatch
         (15.0 + LONGEST_SILENCE + 1.3, lambda: seen.append((bridge.state, bridge.stopped_because))),
         (15.0 + LONGEST_SILENCE + 1.4, simulated.control.quit),
     ]
+    simulated.script = sorted(
+        [*simulated.script, *((float(t), simulated.read) for t in range(11, 18))], key=itemgetter(0)
+    )
     with simulated.control:
         simulated.control.run()
     ready = BridgeState.READY
