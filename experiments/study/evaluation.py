@@ -1,8 +1,7 @@
-"""A study's rallies: every model with its own player and with others, in one compiled call, under code names."""
+"""A study's rallies with virtual players: every model with its own player and with others, in one compiled call."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 
@@ -16,18 +15,16 @@ from ballmodel.io.atomic_files import replacing
 from ballmodel.registry import Balls
 from experiments.config import build
 from experiments.config.study import Study
-from experiments.study import blind_protocol
-from experiments.study.analysis import effect_costs, scoring
+from experiments.study.analysis import scoring
 from experiments.study.analysis.study_folder import BallLog
 from experiments.study.paths import StudyPaths
-from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallyResult
 
 LOGGED_TOUCHES = 30  # human hits that are kept, per rally and session on average
-EVALUATION, EFFECTS = 7, 8  # purposes of keys, beside those of experiments.config.build
+EVALUATION = 7  # purpose of a key, beside those of experiments.config.build
 Pairings = Sequence[tuple[str, str, str]]  # trainer, evaluator, model
 
 
@@ -60,52 +57,6 @@ def play(
     return jax.tree.map(np.asarray, result)
 
 
-def play_without(
-    study: Study,
-    reality: VirtualReality,
-    seed: int,
-    models: Sequence[tuple[str, str]],
-    policies: Sequence[Policy],
-    balls: Sequence[Balls],
-) -> list[effect_costs.Outcome]:
-    """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
-
-    balls: what each policy was trained for. What the study's own reality lacks is left out of all worlds.
-    """
-    sessions, settings = study.evaluation.lanes, study.evaluation
-    absent, everything = tuple(study.reality.without), tuple(hidden_effects.RANGES)
-    special = {effect_costs.NOTHING: (), effect_costs.ALL: everything}
-    left_out = [absent + special.get(world, (world,)) for world in effect_costs.WORLDS]
-    outside = tuple(study.reality.outside)
-    worlds = [hidden_effects.draw(seed, names, () if set(names) == set(everything) else outside) for names in left_out]
-    people = [
-        human_player.without_spin(person) if "spin" in names else person
-        for names in left_out
-        for person in (human_player.load(player) for player, _ in models)
-    ]
-    # Batch axis: worlds x models x sessions.
-    policy, box = _stack(policies, balls, lambda stacked: jnp.tile(jnp.repeat(stacked, sessions, axis=-1), len(worlds)))
-    result = reality.simulator.play(
-        policy,
-        jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), human_player.stack(people)),
-        hidden_effects.stack_worlds(worlds, len(models) * sessions),
-        build.key(seed, EFFECTS),
-        settings.rallies // sessions,
-        box,
-        settings.max_touches,
-    )
-    shape = (-1, len(worlds), len(models), sessions)
-    length, end = (np.moveaxis(np.asarray(x).reshape(shape), 0, -1) for x in (result.length, result.end))
-    counts = ~np.isin(end, [int(e) for e in scoring.FILTERED])
-    found = []
-    for m, (player, model) in enumerate(models):
-        for w, without in enumerate(effect_costs.WORLDS):
-            lengths = length[w, m][counts[w, m]]
-            mean = float(lengths.mean()) if lengths.size else float("nan")
-            found.append(effect_costs.Outcome(seed, player, model, without, lengths.size, mean))
-    return found
-
-
 def _stack(policies: Sequence[Policy], balls: Sequence[Balls], spread: Callable[[Array], Array]) -> tuple[Policy, Box]:
     """Policies and the boxes of their balls, one (..., n) array each, spread over the batch axis."""
 
@@ -116,23 +67,13 @@ def _stack(policies: Sequence[Policy], balls: Sequence[Balls], spread: Callable[
     return jax.tree.map(stack, *policies), Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes)))
 
 
-def draw_codes(seed: int, pairings: Pairings) -> list[str]:
-    """A code for each pairing, one to one among the models that a player evaluates."""
-    codes: dict[tuple[str, str, str], str] = {}
-    for evaluator in dict.fromkeys(e for _, e, _ in pairings):
-        evaluated = {f"{trainer}/{model}": (trainer, e, model) for trainer, e, model in pairings if e == evaluator}
-        rng = np.random.default_rng([seed, zlib.crc32(evaluator.encode())])
-        codes |= {evaluated[name]: code for name, code in blind_protocol.draw(evaluated, rng).items()}
-    return [codes[pairing] for pairing in pairings]
-
-
 def score(seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> scoring.Rallies:
     """All rallies as scored lines; the sessions of a pairing count as one, their rallies in turn."""
     parts = []
-    for i, (pairing, code) in enumerate(zip(pairings, draw_codes(seed, pairings), strict=True)):
+    for i, pairing in enumerate(pairings):
         mine = slice(i * sessions, (i + 1) * sessions)
         parts.append(
-            scoring.score_rallies(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel())
+            scoring.score_rallies(seed, *pairing, "", result.length[:, mine].ravel(), result.end[:, mine].ravel())
         )
     return scoring.join(parts)
 

@@ -56,12 +56,6 @@ def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     return tuple(one for one in found if isinstance(one, Range))
 
 
-def prior_world(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
-    """The world of a model YAML's content with these ranges in place of what it draws. Raises ValueError."""
-    plain = {key: value for key, value in model.items() if key != "randomise"}
-    return ModelFile(models.from_dict(plain, "simulation.model").model, read_prior(ranges, "identification.prior"))
-
-
 def identify(
     logs: Sequence[Path],
     most: int,

@@ -27,10 +27,9 @@ from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.study import blind_protocol, evaluation, identification, training
-from experiments.study.analysis import effect_costs, scoring
+from experiments.study.analysis import scoring
 from experiments.study.analysis.identified import list_estimates
-from experiments.study.analysis.study_folder import ROUNDS, changes_of
-from experiments.study.paths import CONVERGENCE, EVALUATIONS, JOINTS, POLICY, PRIOR, REALITY, REPORT, StudyPaths
+from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import (
     ORACLE,
     Human,
@@ -43,12 +42,11 @@ from experiments.study.schedule import (
     list_pairings,
 )
 from experiments.study.target_domain import hidden_effects, on_robot
-from experiments.study.target_domain.evaluation_on_robot import make_blind_steps, make_rally_step
+from experiments.study.target_domain.play_on_robot import make_blind_steps, make_rally_step
 from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
-from mjx_tt.sim.model import ModelFile
 
 
 class Pipeline:
@@ -84,19 +82,11 @@ class Pipeline:
             found.append(self._seal_reality(seed))
             if study.identification is not None:
                 found.append(self._log_joints(seed, study.identification.seconds))
-        if study.randomised:
-            found.append(self._draw_prior(seed))
         for player in study.players:
             found.append(self._first_balls(seed, player))
-            if study.bound:
-                found.append(self._copy_reality(seed, player))
             found += [self._make_item(seed, player, item) for item in list_items(study, player)]
-            if study.baselines:
-                found.append(self._measure_convergence(seed, player))
         if study.robot is None:
             found.append(self._evaluate(seed))
-            if study.evaluation.effects:
-                found.append(self._measure_effects(seed))
         else:
             found += self._play_on_rig(seed) if study.robot == RIG else self._play_blind(seed, study.robot)
         return found
@@ -138,25 +128,6 @@ class Pipeline:
             return f"{seconds:g} s of {len(records)} joints"
 
         return Step(name, "joints", 1, (), tuple(folder / file for file in ROBOT_FILES), run)
-
-    def _draw_prior(self, seed: int) -> Step:
-        path, settings = self.paths.world(seed, "", PRIOR), self.study.identification or Identification()
-
-        def run() -> str:
-            world = identification.prior_world(self.study.simulation.model, settings.prior)
-            world.save(path)
-            return f"{len(world.randomise)} parameters drawn"
-
-        return Step(f"seed{seed}/{PRIOR}", "worlds", 1, (), (path,), run)
-
-    def _copy_reality(self, seed: int, player: str) -> Step:
-        path, name = self.paths.world(seed, player, REALITY), f"seed{seed}/{player}/{REALITY} as a world"
-
-        def run() -> str:
-            ModelFile(self._virtual[seed].add_spin(player, name)).save(path)
-            return "for the bound alone"
-
-        return Step(name, "worlds", 1, (), (path,), run)
 
     # -- the items of a player
 
@@ -240,8 +211,8 @@ class Pipeline:
         simulation = self.study.simulation
         episodes = simulation.optimiser.num_directions * simulation.optimiser.repeats
         work = count_updates(self.study, item) * episodes * simulation.seeds
-        players_own = item.world not in (None, PRIOR)  # a world of one player is in the program
-        program = None if players_own else f"training of round {item.round} in {item.world or 'the world as believed'}"
+        # An identified world is in the program.
+        program = None if item.world else f"training of round {item.round} in the world as believed"
         compiled = Run(folder / "training" / "seed0").metrics
         return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
 
@@ -267,19 +238,6 @@ class Pipeline:
         work, inputs = count_updates(self.study, item), (self.paths.model(seed, player, item.source) / POLICY,)
         return Step(name, "fine-tuning", work, inputs, outputs, run, "fine-tuning")
 
-    def _measure_convergence(self, seed: int, player: str) -> Step:
-        sources = tuple(self.paths.human(seed, player, name) for name in ROUNDS)
-        path = self.paths.player(seed, player) / CONVERGENCE
-
-        def run() -> str:
-            fitted = {name: load_distribution(source) for name, source in zip(ROUNDS, sources, strict=True)}
-            first, second = changes_of(fitted)
-            content = {"mean change of the 16 numbers over their ranges": {"M0-M1": first, "M1-M2": second}}
-            run_dir.write_json(path, content | {"converging": second < first})
-            return f"human model changed by {first:.1%}, then by {second:.1%} of its range"
-
-        return Step(f"seed{seed}/{player}/convergence", "convergence", 1, sources, (path,), run)
-
     # -- evaluations
 
     def _evaluate(self, seed: int) -> Step:
@@ -301,20 +259,6 @@ class Pipeline:
         humans = tuple(self.paths.human(seed, *one) for one in balls if one[1].startswith("M"))
         inputs = (*dict.fromkeys(self._policy_of(seed, *one) for one in models), *humans)
         return Step(f"seed{seed}/evaluation", "evaluation", len(pairings), inputs, (path,), run)
-
-    def _measure_effects(self, seed: int) -> Step:
-        models = [(player, model) for player in self.study.players for model in effect_costs.MODELS]
-        path = self.paths.seed(seed) / effect_costs.FILE
-
-        def run() -> str:
-            reality = self._virtual[seed].reality
-            found = evaluation.play_without(self.study, reality, seed, models, *self._policies_and_balls(seed, models))
-            effect_costs.write(path, found)
-            return f"{sum(o.rallies for o in found):,} rallies in {len(effect_costs.WORLDS)} worlds"
-
-        humans = (self.paths.human(seed, player, name) for player in self.study.players for name in ROUNDS)
-        inputs = (*(self._policy_of(seed, *one) for one in models), *humans)
-        return Step(f"seed{seed}/effects", "effects", len(models) * len(effect_costs.WORLDS), inputs, (path,), run)
 
     def _play_on_rig(self, seed: int) -> list[Step]:
         """The evaluation on the rig, by its virtual players."""

@@ -34,9 +34,6 @@ WIDEST = 4.0  # high over low end of a ratio's interval that still shows "no dif
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
 SHORT_RALLY = 5  # touches
-TUNED = {"is2r-sim1": "is2r-ft35", "is2r-sim2": "is2r-ft65", "is2r-sim3": "is2r-ft100", "oracle-sim": "oracle-ft"}
-"""Zero-shot policies, and what fine-tuning makes of them."""
-SMOOTH = 10  # updates over which a fine-tuning's return rate is averaged
 ONE_SEED = "the players of one seed alone, who share its reality"
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS = (
     "agrees",
@@ -53,7 +50,6 @@ UNITS = {
     "kept_ratio": RATIO,
     "model_change": RATIO,
     "model_change_by_level": RATIO,
-    "tuning_cost": RATIO,
     "normalised_difference": DIFFERENCE,
     "short_share_difference": DIFFERENCE,
     "longer_share": SHARE,
@@ -89,18 +85,13 @@ class Measurements:
     A statistic is None where the study lacks what it needs.
     """
 
-    def __init__(self, study: StudyFolder, over_seeds: bool = True) -> None:
-        self.study, self.over_seeds = study, over_seeds
+    def __init__(self, study: StudyFolder) -> None:
+        self.study = study
 
     @cached_property
     def raw(self) -> Bootstrap:
         """Rally lengths that the paper reports, own and cross-evaluations."""
-        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds, longest=True)
-
-    @cached_property
-    def unselected(self) -> Bootstrap:
-        """Lengths of all rallies that are not filtered."""
-        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds)
+        return Bootstrap(self.study.pick(own=None, selected=False), longest=True)
 
     @cached_property
     def normalised(self) -> Bootstrap:
@@ -125,19 +116,17 @@ class Measurements:
         """All claims by their keys, in the paper's order."""
         return {claim.key: evaluate(claim, self) for claim in CLAIMS}
 
-    def length_ratio(
-        self, a: str, b: str, group: str = "all", others: bool = False, boot: Bootstrap | None = None
-    ) -> Estimate | None:
+    def length_ratio(self, a: str, b: str, group: str = "all", others: bool = False) -> Estimate | None:
         """Mean length of model a over that of b, over the players of a group that have both.
 
         others: with players who did not train the policy
         """
-        pair = (boot or self.raw).pair(a, b, of_level(group), not others)
+        pair = self.raw.pair(a, b, of_level(group), not others)
         return pair and pair[0] / pair[1]
 
-    def kept_ratio(self, models: Sequence[str], boot: Bootstrap | None = None) -> Estimate | None:
+    def kept_ratio(self, models: Sequence[str]) -> Estimate | None:
         """Mean length with other players over that with the trainer, all models together."""
-        pair = (boot or self.raw).pair(models, models, BY_SKILL, False, True)
+        pair = self.raw.pair(models, models, BY_SKILL, False, True)
         return pair and pair[0] / pair[1]
 
     def mean_length(self, model: str) -> Estimate | None:
@@ -159,7 +148,7 @@ class Measurements:
     def short_share_difference(self, a: str, b: str) -> Estimate | None:
         """Share of rallies below SHORT_RALLY of model a minus that of b."""
         rallies = self.study.pick(FINAL, selected=False)
-        boot = Bootstrap(rallies, rallies.length < SHORT_RALLY, self.over_seeds, longest=True)
+        boot = Bootstrap(rallies, rallies.length < SHORT_RALLY, longest=True)
         return self._difference(boot, a, b, "all", False)
 
     def longer_share(self, a: str, b: str) -> Estimate | None:
@@ -176,7 +165,7 @@ class Measurements:
         rallies = self.study.pick(TEN, selected=False)
         rallies = rallies.take(rallies.end != End.NONE)
         ended = (rallies.robot_ended == 1) | np.isin(rallies.end, (End.ROBOT_GRAZES_NET, End.ROBOT_CORNER))
-        return Bootstrap(rallies, ended, self.over_seeds).mean(TEN, BY_SKILL)
+        return Bootstrap(rallies, ended).mean(TEN, BY_SKILL)
 
     def over_share(self, model: str, group: str) -> Estimate | None:
         """Of the balls that were not returned, the share hit over the human's end line."""
@@ -206,26 +195,6 @@ class Measurements:
         """Second change of the human model, beginners over intermediate players."""
         return model_change_by_level(self.changes)
 
-    def tuning_cost(self) -> Interval | None:
-        """Updates of fine-tuning after a player's worst zero-shot policy over those after the best, to an equal level.
-
-        The level is the highest return rate, averaged over SMOOTH updates, that all of the player's fine-tunings reach.
-        """
-        logs = {}
-        for seed, player in ((s, p) for s in self.study.seeds for p in self.study.players):
-            found = []
-            for zero_shot, tuned in TUNED.items():
-                length = self.raw.point.get((seed, player, player, zero_shot))
-                rates = [row["return_rate"] for row in self.study.metrics(seed, player, tuned)]
-                if length is not None and len(rates) >= SMOOTH:
-                    found.append((length, np.convolve(rates, np.full(SMOOTH, 1.0 / SMOOTH), "valid")))
-            if len(found) > 1:
-                level = min(rates.max() for _, rates in found)
-                (_, worst), *_, (_, best) = sorted(found, key=lambda pair: pair[0])
-                taken = [int(np.argmax(rates >= level)) + SMOOTH for rates in (worst, best)]
-                logs[seed, player] = float(np.log(taken[0] / taken[1]))
-        return _geometric_mean(logs)
-
     def _difference(self, boot: Bootstrap, a: str, b: str, group: str, others: bool) -> Estimate | None:
         """Mean of a minus mean of b; ``larger`` is of the rally lengths."""
         pair, lengths = (x.pair(a, b, of_level(group), not others) for x in (boot, self.raw))
@@ -235,7 +204,7 @@ class Measurements:
 
     def _finite(self, rallies: Rallies, values: np.ndarray) -> Bootstrap:
         good = np.isfinite(values)
-        return Bootstrap(rallies.take(good), values[good], self.over_seeds, longest=True)
+        return Bootstrap(rallies.take(good), values[good], longest=True)
 
     def _ball_share(
         self, model: str, trainers: Iterable[str], choose: Callable[[BallLog], tuple[np.ndarray, np.ndarray]]

@@ -41,7 +41,6 @@ class Claim:
     expect: str
     paper: float | None = None
     of: dict[str, Any] = field(default_factory=dict)
-    summary: dict[str, str] | None = None
 
 
 METHODS: dict[str, tuple[Model, ...]] = {
@@ -50,11 +49,10 @@ METHODS: dict[str, tuple[Model, ...]] = {
 }
 COLOURS: dict[str, str] = {method: content["colour"] for method, content in _DATA["methods"].items()}
 LEGEND: dict[str, str] = {method: content["legend"] for method, content in _DATA["methods"].items()}
-IS2R, S2R, ORACLE, FRESH, RANDOMISED, IDENTIFIED, BOUND, ABLATION = METHODS
+IS2R, S2R, ORACLE, FRESH, IDENTIFIED, ABLATION = METHODS
 BY_KEY = {model.key: model for models in METHODS.values() for model in models}
 MODELS = METHODS[IS2R] + METHODS[S2R] + METHODS[ORACLE]
 VARIANT, ABLATED = METHODS[FRESH], METHODS[ABLATION]
-OTHER_WORLDS = METHODS[RANDOMISED] + METHODS[IDENTIFIED] + METHODS[BOUND]
 TEN = tuple(model.key for model in MODELS)
 SHORT: dict[str, str] = _DATA["final"]
 LAST = tuple(SHORT)

@@ -1,9 +1,9 @@
-"""Means, differences and ratios of rally lengths with 95 % intervals, normalised rally lengths, tests of differences.
+"""Means, differences and ratios of rally lengths with 95 % intervals, and normalised rally lengths.
 
-Three sources of chance are kept apart. Student's t over the pooled rallies is the paper's way. The bootstrap over
-rallies draws them anew within each policy. The bootstrap over seeds draws the study's repetitions anew as well, so that
-its interval holds for a policy that is trained again; players are always the same ones. Of fewer than FEWEST_SEEDS
-seeds it would draw a handful of points, which are no 95 %: there it is the bootstrap over rallies.
+Student's t over the pooled rallies is the paper's way. The bootstrap draws rallies anew within each policy, and the
+study's repetitions (seeds) as well, so that its interval holds for a policy that is trained again; players are always
+the same ones. Of fewer than FEWEST_SEEDS seeds it would draw a handful of points, which are no 95 %: there it draws
+rallies alone.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
+from experiments.stats import t_interval, welch_interval, welch_p
 from experiments.study.analysis.scoring import Rallies, count_reported
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
-PERMUTATIONS = 4000
 Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
 Models = str | Iterable[str]  # one or several
 
@@ -92,7 +91,6 @@ class Bootstrap:
         self,
         rallies: Rallies,
         values: np.ndarray | None = None,
-        over_seeds: bool = True,
         draws: int = DRAWS,
         key: int = 0,
         longest: bool = False,
@@ -102,7 +100,6 @@ class Bootstrap:
         rng = np.random.default_rng(key)
         reported = rallies.selected if longest else np.ones(len(rallies), bool)
         self.cells = group_by_cell(rallies.take(reported), values[reported])
-        self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         pooled = rallies.pooled if longest else reported
         order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
@@ -111,9 +108,8 @@ class Bootstrap:
             for cell, v in group_by_cell(rallies.take(order), values[order]).items()
         }
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
-        self._chosen = {
-            s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, len(self.seeds) + 1) if over_seeds
-        }
+        seeds = len({cell[0] for cell in self.cells})
+        self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, seeds + 1)}
 
     def mean(self, models: Models, trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
         """Mean over the models' cells of a trainer, then over trainers, then over seeds; None where there is no cell.
@@ -213,26 +209,6 @@ def _standardise(rallies: Rallies, group: Sequence[str], reference: np.ndarray) 
     return out
 
 
-def estimate_share(held: Iterable[tuple[int, bool]]) -> Interval:
-    """Share of what holds, (seed, true or false) each, with percentiles of a bootstrap over seeds.
-
-    What belongs to one seed shares its reality and its logs, so that seeds alone are drawn anew, S - 1 of S; without an
-    interval (NaN) where there are fewer than FEWEST_SEEDS.
-    """
-    table: dict[int, list[int]] = {}
-    for seed, true in held:
-        counts = table.setdefault(seed, [0, 0])
-        counts[0] += true
-        counts[1] += 1
-    count = np.array(list(table.values())).T  # (2, S) that hold, and all
-    value, seeds = float(count[0].sum() / count[1].sum()), count.shape[1]
-    if seeds < FEWEST_SEEDS:
-        return Interval(value, np.nan, np.nan, int(count[1].sum()))
-    drawn = count[:, np.random.default_rng(0).integers(0, seeds, (seeds - 1, DRAWS))].sum(axis=1)
-    low, high = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
-    return Interval(value, float(low), float(high), int(count[1].sum()))
-
-
 def average_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
     """Mean of values by seed and player: over the players of each seed, then over seeds, with Student's t over seeds.
 
@@ -257,59 +233,28 @@ def t_mean(values: ArrayLike) -> Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean of one set of policies minus that of another, with what speaks for it.
+    """Mean of one model minus that of another: the bootstrap's interval, and the paper's way, Welch's t over rallies.
 
-    bootstrap: over seeds, if there are enough, and rallies; welch: t interval over the pooled rallies, the paper's way
-    p_welch, p_rallies: two-sided, a rally is the unit (Welch's t; permutation within each pair of policies)
-    p_policies: two-sided, a pair of policies (one seed, one player) is the unit; ``pairs`` of them
+    p: two-sided, of Welch's t; it takes rallies as independent, so it holds for these very policies
     """
 
     bootstrap: Interval
     welch: Interval
-    p_welch: float
-    p_rallies: float
-    p_policies: float
-    pairs: int
+    p: float
 
 
-def compare_models(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bool = True) -> Difference | None:
-    """Of model ``a`` minus model ``b``, over pairs of cells that differ in the model only."""
+def compare_models(boot: Bootstrap, a: str, b: str, trainers: Iterable[str]) -> Difference | None:
+    """Of model ``a`` minus model ``b``, over own evaluations of trainers and seeds that have both; None without any."""
     trainers = tuple(trainers)
-    pairs = [
-        (boot.cells[cell], boot.cells[(*cell[:3], b)])
-        for cell in boot.cells
-        if cell[3] == a and cell[1] in trainers and _is(own, cell) and (*cell[:3], b) in boot.cells
-    ]
-    both = boot.pair(a, b, trainers, own)
-    if both is None or not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
+    both = boot.pair(a, b, trainers)
+    if both is None:
         return None
-    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return Difference(
-        (both[0] - both[1]).interval,
-        Interval(*welch_interval(second, first), first.size + second.size),
-        welch_p(first, second),
-        permute_rallies(pairs),
-        sign_flip([x.mean() - y.mean() for x, y in pairs]),
-        len(pairs),
-    )
-
-
-def permute_rallies(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
-    """Two-sided p of the mean difference over pairs of samples, whose members are exchanged within each pair.
-
-    The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010). SciPy's
-    permutation_test has no pairs of samples of different sizes.
-    """
-    rng = np.random.default_rng(key)
-    observed, drawn = 0.0, np.zeros(draws)
-    for x, y in pairs:
-        both = np.concatenate([x, y])
-        order = rng.permuted(np.broadcast_to(np.arange(both.size), (draws, both.size)), axis=1)
-        mixed = both[order]
-        observed += x.mean() - y.mean()
-        drawn += mixed[:, : x.size].mean(axis=1) - mixed[:, x.size :].mean(axis=1)
-    extreme = np.abs(drawn) >= abs(observed) * (1.0 - 1e-12)
-    return float((extreme.sum() + 1) / (draws + 1))
+    paired = [c for c in boot.cells if c[3] == a and c[1] == c[2] and c[1] in trainers and (*c[:3], b) in boot.cells]
+    first, second = (np.concatenate([boot.cells[(*c[:3], model)] for c in paired]) for model in (a, b))
+    if min(first.size, second.size) < 2:
+        return None
+    welch = Interval(*welch_interval(second, first), first.size + second.size)
+    return Difference((both[0] - both[1]).interval, welch, welch_p(first, second))
 
 
 def _is(own: bool | None, cell: Cell) -> bool:

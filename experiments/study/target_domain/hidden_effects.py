@@ -120,15 +120,6 @@ def _uniform(seed: int, path: str, low: float, high: float) -> float:
     return float(np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(low, high))
 
 
-def stack_worlds(worlds: list[SimModel], sessions: int) -> SimModel:
-    """All worlds in one model, each for as many neighbouring sessions: what differs is (worlds * sessions,)."""
-    values = [models.paths(world) for world in worlds]  # also of drives that a world does not have
-    differ = [path for path in values[0] if len({v[path] for v in values}) > 1]
-    return models.with_values(
-        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), sessions) for path in differ}
-    )
-
-
 def list_differences(model: SimModel) -> dict[str, float]:
     """Values of a reality that differ from what training believes, by dotted path."""
     nominal = models.paths()

@@ -51,7 +51,6 @@ from mjx_tt.sim.model import SimModel
 
 SELECTION_SESSIONS = 10  # side by side in which policies are compared
 ATTEMPTS = 100  # of a ball, after which a player who brings none onto the robot's half is taken as they are
-STROKES = 512  # from which the spin of a player's strokes is known
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
 
@@ -236,17 +235,6 @@ class VirtualReality:
         }
 
 
-def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
-    """The reality's model with mean and spread of the spin of a player's strokes."""
-    state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
-    spin = np.asarray(state.ball.spin)
-    mean, std = (
-        {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
-        for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
-    )
-    return models.with_values(reality.model, mean | std)
-
-
 class VirtualWorld:
     """A seed's reality for the loop, as ``RobotWorld``; all chance follows from ``name``, that of a step."""
 
@@ -261,10 +249,6 @@ class VirtualWorld:
         return self.reality.first_balls(
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
-
-    def add_spin(self, player: str, name: str) -> SimModel:
-        """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
-        return add_spin(self.reality, player, self._key(name))
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
