@@ -14,7 +14,6 @@ import csv
 import hashlib
 import itertools
 import json
-import re
 import secrets
 import shutil
 import string
@@ -39,7 +38,6 @@ BEGUN = ".begun"  # while an evaluation is being made
 SHEET_COLUMNS = ("code", "rally", "length", "end")
 SEPARATORS = ",;\t"
 SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtered
-_WHOLE = re.compile("[0-9]{1,9}")
 
 
 # The bijection and its seal
@@ -201,42 +199,28 @@ def read_sheet(path: Path) -> dict[str, list[Played]]:
 
     Cells may be separated by commas, semicolons or tabs: what a spreadsheet writes depends on its country.
     """
-    try:
+    with error_context(str(path)):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
     filled = [(n, x) for n, x in enumerate(lines, 1) if x.strip() and not x.lstrip().startswith(("#", '"#'))]
     head = filled[0][1] if filled else ""
     separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
     if separator is None:
-        raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
+        raise ConfigError(f"{path}: expected the first line {','.join(SHEET_COLUMNS)}, got {head.strip()}")
     played: dict[str, list[Played]] = {}
     for number, line in filled[1:]:
         code, rally, length, end = (_cells(line, separator) + [""] * 4)[:4]
         if not any((code, rally, length, end)):
             continue
         rallies = played.setdefault(code, [])
-        if not length and not end:
-            continue
-        with error_context(f"{path}: line {number}"):
-            one = _parse_rally(rally, length, end)
-            if any(p.rally == one.rally for p in rallies):
-                raise ValueError(f"rally {rally} of {code} is there twice")
-            rallies.append(one)
+        if length or end:
+            with error_context(f"{path}: line {number}"):
+                one = Played(int(rally), int(length), scoring.parse_end(end))
+                if any(p.rally == one.rally for p in rallies):
+                    raise ValueError(f"rally {rally} of {code} is there twice")
+                if one.length < 0 or not one.length and one.end not in scoring.FILTERED:
+                    raise ValueError(f"length {length}: the human's first hit is 1, and a rally with end {end} counts")
+                rallies.append(one)
     return {code: sorted(rallies, key=lambda p: p.rally) for code, rallies in played.items()}
-
-
-def _parse_rally(rally: str, length: str, end: str) -> Played:
-    """A line of the sheet. Raises ValueError."""
-    if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
-        raise ValueError(f"rally and length are whole numbers, got {rally!r} and {length!r}")
-    try:
-        played = Played(int(rally), int(length), scoring.parse_end(end))
-    except ValueError as error:
-        raise ValueError(f"end: {error}") from None
-    if not played.length and played.end not in scoring.FILTERED:
-        raise ValueError(f"length 0: the human's first hit is 1, and a rally with end {end} counts")
-    return played
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -104,7 +104,7 @@ class Pipeline:
         def run() -> str:
             return f"sealed with SHA-256 {blind_protocol.seal(path, self._reality(seed))[:16]}..."
 
-        return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
+        return Step(f"seed{seed}/reality", (), (path,), run)
 
     def _open_reality(self, seed: int) -> Step:
         sealed, path = (self.paths.seed(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
@@ -117,7 +117,7 @@ class Pipeline:
             run_dir.write_yaml(path, content)
             return "opened"
 
-        return Step(f"seed{seed}/reality opened", "seal", 1, inputs, (path,), run)
+        return Step(f"seed{seed}/reality opened", inputs, (path,), run)
 
     def _log_joints(self, seed: int, seconds: float) -> Step:
         folder, name = self.paths.seed(seed) / JOINTS, f"seed{seed}/{JOINTS}"
@@ -127,7 +127,7 @@ class Pipeline:
             identification.write_joints(folder, records)
             return f"{seconds:g} s of {len(records)} joints"
 
-        return Step(name, "joints", 1, (), tuple(folder / file for file in ROBOT_FILES), run)
+        return Step(name, (), tuple(folder / file for file in ROBOT_FILES), run)
 
     # -- the items of a player
 
@@ -139,7 +139,7 @@ class Pipeline:
             measurements.write_csv(path, measured)
             return f"{len(measured):,} balls without a robot"
 
-        return Step(name, "first balls", 1, (), (path,), run)
+        return Step(name, (), (path,), run)
 
     def _make_item(self, seed: int, player: str, item: Item) -> Step:
         if isinstance(item, Human):
@@ -161,7 +161,7 @@ class Pipeline:
             save_distribution(path, distribution)
             return f"fitted to {report.landing.shape[1]:,} of {report.measured:,} balls"
 
-        return Step(f"seed{seed}/{player}/{item.name}", "human model", len(sources), sources, (path,), run)
+        return Step(f"seed{seed}/{player}/{item.name}", sources, (path,), run)
 
     def _identify(self, seed: int, player: str, item: Identified) -> Step:
         settings = self.study.identification
@@ -185,7 +185,7 @@ class Pipeline:
             return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn{doubt}"
 
         inputs = (*data, *motion, *(folder / identification.BALLS for folder in hits))
-        return Step(name, "identification", len(data), inputs, (path,), run)
+        return Step(name, inputs, (path,), run)
 
     def _joints_of(self, seed: int, hits: tuple[Path, ...], settings: Identification) -> Path | None:
         """The log of the joints for an identification: from before the first ball; on a robot the newest play's."""
@@ -208,13 +208,10 @@ class Pipeline:
             score = self._world[seed].score(player, name)
             return training.train_seeds(self.study, item, folder, human, source, name, self.console, score, world)
 
-        simulation = self.study.simulation
-        episodes = simulation.optimiser.num_directions * simulation.optimiser.repeats
-        work = count_updates(self.study, item) * episodes * simulation.seeds
         # An identified world is in the program.
         program = None if item.world else f"training of round {item.round} in the world as believed"
         compiled = Run(folder / "training" / "seed0").metrics
-        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
+        return Step(name, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
 
     def _fine_tune(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.paths.model(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
@@ -235,8 +232,8 @@ class Pipeline:
             load_policy.load(folder).policy.save(folder / POLICY)
             return text
 
-        work, inputs = count_updates(self.study, item), (self.paths.model(seed, player, item.source) / POLICY,)
-        return Step(name, "fine-tuning", work, inputs, outputs, run, "fine-tuning")
+        inputs = (self.paths.model(seed, player, item.source) / POLICY,)
+        return Step(name, inputs, outputs, run, "fine-tuning")
 
     # -- evaluations
 
@@ -258,7 +255,7 @@ class Pipeline:
         balls = sorted({(trainer, self._balls_of(trainer, model)) for trainer, model in models})
         humans = tuple(self.paths.human(seed, *one) for one in balls if one[1].startswith("M"))
         inputs = (*dict.fromkeys(self._policy_of(seed, *one) for one in models), *humans)
-        return Step(f"seed{seed}/evaluation", "evaluation", len(pairings), inputs, (path,), run)
+        return Step(f"seed{seed}/evaluation", inputs, (path,), run)
 
     def _play_on_rig(self, seed: int) -> list[Step]:
         """The evaluation on the rig, by its virtual players."""
@@ -294,7 +291,7 @@ class Pipeline:
             scoring.write(path, rallies)
             return f"{len(rallies):,} rallies"
 
-        return Step("evaluations", "evaluations", len(sources), sources, (path,), run)
+        return Step("evaluations", sources, (path,), run)
 
     def _report(self, played: list[Step]) -> Step:
         inputs = tuple(p for step in played for p in step.outputs if p.suffix in (".csv", ".yaml", ".json"))
@@ -304,7 +301,7 @@ class Pipeline:
 
             return str(page.write(self.paths.folder))
 
-        return Step("report", "report", 1, inputs, (self.paths.folder / REPORT,), run)
+        return Step("report", inputs, (self.paths.folder / REPORT,), run)
 
     def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
         return self.paths.model(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY

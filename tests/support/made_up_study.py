@@ -15,9 +15,8 @@ import numpy as np
 from ballmodel import constants as c
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
-from experiments.study import blind_protocol
-from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, OTHER_WORLDS, VARIANT
+from experiments.study.analysis import scoring
+from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, IDENTIFIED, METHODS, MODELS, VARIANT
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, SimModel
 
@@ -42,18 +41,6 @@ MEANS = {
     "id-ft65": 10.0,
     "id-sim3": 11.0,
     "id-ft100": 12.0,
-    "prior-sim1": 5.0,
-    "prior-ft35": 5.6,
-    "prior-sim2": 6.0,
-    "prior-ft65": 6.5,
-    "prior-sim3": 7.2,
-    "prior-ft100": 7.5,
-    "bound-sim1": 7.5,
-    "bound-ft35": 8.2,
-    "bound-sim2": 10.0,
-    "bound-ft65": 10.5,
-    "bound-sim3": 12.5,
-    "bound-ft100": 13.0,
     "large": 3.5,
     "medium": 5.8,
     "narrow": 3.0,
@@ -62,7 +49,6 @@ MEANS = {
 SKILL = {"player3": 1.0, "player5": 1.4, "player4": 2.0, "player2": 2.4, "player1": 2.8}
 KEPT = {"is2r-ft100": 0.7, "s2r-ft100": 0.35, "oracle-ft": 0.65}
 RALLIES = 80
-WITHOUT = {"magnus": 1.2, "drives": 0.9, "all": 1.5}  # how many times as long the rallies are without an effect
 REALITY = {"ball.table.friction": 0.2, "ball.paddle.restitution": 0.97}
 ROBOT_SHARE = 0.85  # of the counted rallies
 FILTERED_SHARE = 0.08
@@ -81,37 +67,20 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
     folder = Path(folder)
     (folder / "evaluations").mkdir(parents=True, exist_ok=True)
     (folder / "study.yaml").write_text(f"name: made-up\nseeds: {list(seeds)}\nplayers: {list(names)}\n")
-    (folder / "study.json").write_text(
-        json.dumps({"started": "2026-11-21T20:00:00", "versions": {"numpy": np.__version__}})
-    )
     parts = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         for player in names:
             pools = _balls(folder / f"seed{seed}" / player / "balls", player, balls, rng)
-            for key in ("is2r-ft35", "is2r-ft65", "is2r-ft100", "s2r-ft65", "s2r-ft100", "oracle-ft"):
-                _metrics(folder / f"seed{seed}" / player / key, 60 if key == "is2r-ft35" else 70, rng)
-            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *OTHER_WORLDS)]
+            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *METHODS[IDENTIFIED])]
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
             wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
             _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")
-            codes = blind_protocol.draw([f"{e}/{m}" for e, m in wanted], rng)
             for evaluator, model in wanted:
-                one = _play(seed, player, evaluator, model, codes[f"{evaluator}/{model}"], rallies, rng)
+                one = _play(seed, player, evaluator, model, "", rallies, rng)
                 parts.append(one)
                 if model in (*FINAL, "is2r-ft35", "is2r-ft65"):
                     _log(folder / "evaluations" / f"{seed}_{player}_{evaluator}_{model}.npz", one, pools[-1], rng)
-        effect_costs.write(
-            folder / f"seed{seed}" / effect_costs.FILE,
-            [
-                effect_costs.Outcome(
-                    seed, player, model, world, 60, mean_length(player, model) * WITHOUT.get(world, 1.0)
-                )
-                for player in names
-                for model in effect_costs.MODELS
-                for world in effect_costs.WORLDS
-            ],
-        )
         (folder / f"seed{seed}" / "reality.yaml").write_text(json.dumps({"seed": seed, "reality": REALITY}))
     scoring.write(folder / "evaluations.csv", scoring.join(parts))
     return folder
@@ -133,13 +102,6 @@ def _world(path: Path) -> None:
     path.parent.mkdir(parents=True)
     drawn = (Range("ball.table.friction", 0.19, 0.21), Range("ball.paddle.restitution", 0.8, 0.95))
     ModelFile(SimModel(), drawn).save(path)
-
-
-def _metrics(folder: Path, updates: int, rng) -> None:
-    folder.mkdir(parents=True)
-    rate = np.clip(0.3 + 0.4 * np.arange(updates) / updates + rng.normal(0.0, 0.08, updates), 0.0, 1.0)
-    rows = ({"update": k + 1, "mean_return": 2.0 + r, "return_rate": r} for k, r in enumerate(rate))
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
 def _log(path: Path, rallies: scoring.Rallies, balls: np.ndarray, rng) -> None:

@@ -120,7 +120,7 @@ def make_rally_step(
         scoring.write(counted, scored)
         return f"{len(found)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
 
-    return Step(name, "rallies", rallies, inputs, (counted,), run)
+    return Step(name, inputs, (counted,), run)
 
 
 def make_blind_steps(
@@ -160,6 +160,6 @@ def make_blind_steps(
         return f"{len(blind_protocol.open_key(folder)):,} rallies"
 
     return [
-        Step(name, "blind", 1, inputs, (key, sheet), make),
-        Step(f"{name} counted", "blind", 1, (key,), (counted,), count),
+        Step(name, inputs, (key, sheet), make),
+        Step(f"{name} counted", (key,), (counted,), count),
     ]
