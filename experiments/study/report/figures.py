@@ -66,9 +66,9 @@ def draw_methods(m: Measurements) -> Figure | None:
         upper.set_title(plots.group_label(group))
         plots.draw_bars(lower, [[m.raw.mean(key, players)] for key in keys], [[key] for key in keys])
         for axes in (upper, lower):
-            axes.set_xticks(range(len(keys)), [paper.SHORT[key] for key in keys], fontsize=8)
+            axes.set_xticks(range(len(keys)), [paper.SHORT[key] for key in keys], fontsize=8, rotation=20)
     figure.axes[0].set_ylabel("rally length")
-    figure.axes[1].set_ylabel(plots.MEAN)
+    figure.axes[4].set_ylabel(plots.MEAN)
     return figure
 
 

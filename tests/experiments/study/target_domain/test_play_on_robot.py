@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments.study.target_domain.evaluation_on_robot import derive_seed, make_rally_step
 from rich.console import Console
 
 from experiments.deploy import play
