@@ -6,7 +6,7 @@ Folder of a comparison:
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
-  comparison.json, curves.csv, *.png, comparison.html   the report (``report``)
+  comparison.json, *.png, comparison.html   the report (``report``)
 
 An algorithm with a seed is trained in one go: interrupted, that one begins again, and those that are finished stay.
 """
@@ -33,11 +33,9 @@ from experiments.baselines.learners import (
     EvolutionLearner,
     Learner,
     PpoLearner,
-    SacLearner,
 )
-from experiments.baselines.qt_opt import QtOptLearner
 from experiments.config import build
-from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Ppo, QtOpt
+from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, error_context
@@ -52,7 +50,6 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
-BRAX = "brax's training functions"  # trainings by loops that came before them are other ones
 
 
 @dataclass(frozen=True)
@@ -70,21 +67,13 @@ class Common:
         return self.folder / name / f"seed{seed}"
 
     def conditions(self, name: str) -> dict[str, Any]:
-        """Settings that decide a training, as plain data."""
+        """Settings that decide a training and its evaluation, as plain data."""
         config = self.trains_in[name].config.to_dict()
         shared = {key: config[key] for key in ("robot", *OWN, "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
-        if algorithm["kind"] != "bgs":
-            shared["learner"] = BRAX
-        return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
-
-    def evaluation_conditions(self) -> dict[str, Any]:
-        """Settings that decide an evaluation besides the policy."""
-        return {
-            "evaluation": self.experiment.config.evaluation.model_dump(mode="json"),
-            "reality": self.comparison.reality,
-        }
+        judged = {"evaluation": self.experiment.config.evaluation.model_dump(mode="json"), "reality": given["reality"]}
+        return shared | judged | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
 
 def choose(comparison: Comparison, processes: int | None) -> int:
@@ -177,10 +166,7 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner:
         return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
     simulator = Simulator(experiment.task, 1)
-    env = TableTennis(simulator, pool, model.model, model.randomise)
-    if isinstance(settings, QtOpt):
-        return QtOptLearner(settings, env)
-    return PpoLearner(settings, env) if isinstance(settings, Ppo) else SacLearner(settings, env)
+    return PpoLearner(settings, TableTennis(simulator, pool, model.model, model.randomise))
 
 
 class Trainings:
@@ -204,7 +190,7 @@ class Trainings:
         if restored is None:
             raise RunError(f"{folder / 'policy'}: holds no policy, though training.json is there; remove {folder}")
         found = self._judge.final(restored[0])
-        run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
+        run_dir.write_json(folder / "evaluation.json", found)
         rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
         return f"returned in {', in '.join(rates)}"
 
@@ -288,8 +274,7 @@ def _finished(common: Common, name: str, seed: int) -> bool:
         raise RunError(
             f"{folder}: was trained with other settings of {', '.join(differing)}; choose another name or another --out"
         )
-    path = folder / "evaluation.json"
-    return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
+    return (folder / "evaluation.json").exists()
 
 
 def _share(budget: Budget, spent: dict[str, float]) -> float:
