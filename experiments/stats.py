@@ -46,15 +46,6 @@ def welch_interval(a: ArrayLike, b: ArrayLike) -> tuple[float, float, float]:
     return difference, float(interval.low), float(interval.high)
 
 
-def welch_p(a: ArrayLike, b: ArrayLike) -> float:
-    """Two-sided p of equal means by Welch's t; of samples without spread 0, or 1 where they are the same."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    if not a.std() and not b.std():
-        return float(a.mean() == b.mean())
-    with _nearly_equal_values():
-        return float(stats.ttest_ind(a, b, equal_var=False).pvalue)
-
-
 @contextmanager
 def _nearly_equal_values() -> Iterator[None]:
     """Without SciPy's warning that their t is imprecise: intervals and p are as good as those of equal values."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 import base64
 import csv
 import hashlib
-import itertools
 import json
 import secrets
 import shutil
@@ -43,24 +42,17 @@ SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtere
 # The bijection and its seal
 
 
-def list_codes(count: int) -> tuple[str, ...]:
-    """A, B, ... Z, AA, AB, ... in the order of testing."""
-    lengths = (map("".join, itertools.product(string.ascii_uppercase, repeat=n)) for n in itertools.count(1))
-    return tuple(itertools.islice(itertools.chain.from_iterable(lengths), count))
-
-
 def draw(models: Iterable[str], rng: np.random.Generator) -> dict[str, str]:
-    """Code name of every model, one to one, in the order in which they are to be tested.
+    """Code name A, B, ... of every model, one to one, in the order in which they are to be tested.
 
     The order is random and a code is only a place in it, so neither tells anything. Raises ValueError for a model that
-    is given twice.
+    is given twice, and for more than there are letters.
     """
     models = list(models)
-    if len(set(models)) < len(models):
-        raise ValueError(f"each model once, got {', '.join(models)}")
-    return {
-        models[k]: code for code, k in zip(list_codes(len(models)), rng.permutation(len(models)).tolist(), strict=True)
-    }
+    if len(set(models)) < len(models) or len(models) > len(string.ascii_uppercase):
+        raise ValueError(f"expected each model once, {len(string.ascii_uppercase)} at most, got {', '.join(models)}")
+    order = rng.permutation(len(models)).tolist()
+    return {models[k]: code for k, code in zip(order, string.ascii_uppercase, strict=False)}
 
 
 def seal(path: Path, content: Any) -> str:

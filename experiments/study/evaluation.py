@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
@@ -11,19 +10,15 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from ballmodel.io.atomic_files import replacing
 from ballmodel.registry import Balls
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.study.analysis import scoring
-from experiments.study.analysis.study_folder import BallLog
-from experiments.study.paths import StudyPaths
 from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallyResult
 
-LOGGED_TOUCHES = 30  # human hits that are kept, per rally and session on average
 EVALUATION = 7  # purpose of a key, beside those of experiments.config.build
 Pairings = Sequence[tuple[str, str, str]]  # trainer, evaluator, model
 
@@ -43,16 +38,14 @@ def play(
     sessions, settings = study.evaluation.lanes, study.evaluation
     people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
     policy, box = _stack(policies, balls, lambda stacked: jnp.repeat(stacked, sessions, axis=-1))
-    rallies = settings.rallies // sessions
     result = reality.simulator.play(
         policy,
         jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), people),
         reality.known,
         build.key(seed, EVALUATION),
-        rallies,
+        settings.rallies // sessions,
         box,
         settings.max_touches,
-        LOGGED_TOUCHES * rallies,
     )
     return jax.tree.map(np.asarray, result)
 
@@ -76,23 +69,6 @@ def score(seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> 
             scoring.score_rallies(seed, *pairing, "", result.length[:, mine].ravel(), result.end[:, mine].ravel())
         )
     return scoring.join(parts)
-
-
-def save_logs(paths: StudyPaths, seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> None:
-    """Writes each pairing's balls as the arrays of a ``BallLog``."""
-    log = result.balls
-    capacity = log.touch.shape[0]
-    taken = np.arange(capacity)[:, None] < np.minimum(log.count, capacity)  # (capacity, sessions of all pairings)
-    for i, pairing in enumerate(pairings):
-        mine = slice(i * sessions, (i + 1) * sessions)
-        keep = taken[:, mine]
-        arrays = {f.name: getattr(log, f.name)[..., mine] for f in fields(BallLog)}
-        # Rallies are numbered as ``score`` does: the first of each session, then the second of each, ...
-        arrays["rally"] = arrays["rally"] * sessions + np.arange(sessions)
-        path = paths.evaluation_log(seed, *pairing)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **{name: values[..., keep] for name, values in arrays.items()})
 
 
 def summarise(rallies: scoring.Rallies) -> dict[str, float]:

@@ -43,10 +43,6 @@ class StudyPaths:
         """An identified world as a model YAML."""
         return self.player(seed, player) / "identified" / f"{name}.yaml"
 
-    def evaluation_log(self, seed: int, trainer: str, evaluator: str, model: str) -> Path:
-        """The balls of an evaluation."""
-        return self.folder / "evaluations" / f"{seed}_{trainer}_{evaluator}_{model}.npz"
-
     def run(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""
         folder = self.model(seed, player, model)

@@ -31,7 +31,6 @@ from experiments.study.analysis import scoring
 from experiments.study.analysis.identified import list_estimates
 from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import (
-    ORACLE,
     Human,
     Identified,
     Item,
@@ -246,7 +245,6 @@ class Pipeline:
             result = evaluation.play(
                 self.study, self._virtual[seed].reality, seed, pairings, *self._policies_and_balls(seed, models)
             )
-            evaluation.save_logs(self.paths, seed, pairings, result, self.study.evaluation.lanes)
             rallies = evaluation.score(seed, pairings, result, self.study.evaluation.lanes)
             scoring.write(path, rallies)
             lengths = ", ".join(f"{model} {length:.1f}" for model, length in evaluation.summarise(rallies).items())
@@ -304,12 +302,12 @@ class Pipeline:
         return Step("report", inputs, (self.paths.folder / REPORT,), run)
 
     def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
-        return self.paths.model(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY
+        return self.paths.model(seed, trainer, model) / POLICY
 
     def _balls_of(self, trainer: str, model: str) -> str:
         """Name of the balls that a policy was last trained on in simulation."""
         made = {item.key: item for item in list_items(self.study, trainer) if isinstance(item, Simulated | Real)}
-        item = made["oracle-sim" if model == ORACLE else model]
+        item = made[model]
         while isinstance(item, Real):
             item = made[item.source]
         return item.balls

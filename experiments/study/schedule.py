@@ -108,7 +108,6 @@ FRESH: tuple[Item, ...] = (
     Real("fresh-ft100", "fresh-sim3", 2),
 )
 CROSS_ORDER = (FINAL[0], FINAL[2], FINAL[1])  # in which cross-evaluations are played: their chance follows from it
-ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablation
 
 
 def list_items(study: Study, player: str) -> tuple[Item, ...]:
@@ -135,8 +134,6 @@ def list_pairings(study: Study) -> list[tuple[str, str, str]]:
     found: list[tuple[str, str, str]] = []
     for trainer in study.players:
         keys = [item.key for item in list_items(study, trainer) if isinstance(item, Simulated | Real)]
-        if study.ablation and study.ablation.player == trainer:
-            keys.append(ORACLE)
         found += [(trainer, trainer, key) for key in keys]
     if study.evaluation.cross:
         for trainer in study.players:

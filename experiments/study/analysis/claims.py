@@ -6,13 +6,12 @@ over seeds and rallies (``statistics``); those of changes of the human models ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ballmodel import constants as c
 from experiments.stats import welch_interval
 from experiments.study.analysis.paper import BY_SKILL, CLAIMS, FINAL, TEN, Claim, of_level
 from experiments.study.analysis.scoring import Rallies
@@ -27,7 +26,7 @@ from experiments.study.analysis.statistics import (
     normalise_by_player,
     t_mean,
 )
-from experiments.study.analysis.study_folder import BallLog, StudyFolder, changes_of, paper_models
+from experiments.study.analysis.study_folder import StudyFolder, changes_of, paper_models
 from mjx_tt.rally.end_reasons import End
 
 WIDEST = 4.0  # high over low end of a ratio's interval that still shows "no difference": from half to double
@@ -54,8 +53,6 @@ UNITS = {
     "short_share_difference": DIFFERENCE,
     "longer_share": SHARE,
     "robot_ended_share": SHARE,
-    "over_share": SHARE,
-    "middle_share": SHARE,
     "mean_length": HITS,
     "longest_rally": HITS,
 }
@@ -80,7 +77,7 @@ class Finding:
 
 
 class Measurements:
-    """Statistics of a study's rallies, ball logs and human models. Bootstraps are made once.
+    """Statistics of a study's rallies and human models. Bootstraps are made once.
 
     A statistic is None where the study lacks what it needs.
     """
@@ -167,26 +164,6 @@ class Measurements:
         ended = (rallies.robot_ended == 1) | np.isin(rallies.end, (End.ROBOT_GRAZES_NET, End.ROBOT_CORNER))
         return Bootstrap(rallies, ended).mean(TEN, BY_SKILL)
 
-    def over_share(self, model: str, group: str) -> Estimate | None:
-        """Of the balls that were not returned, the share hit over the human's end line."""
-
-        def choose(log: BallLog) -> tuple[np.ndarray, np.ndarray]:
-            with np.errstate(invalid="ignore"):
-                far = log.hit.astype(bool) & (log.return_landing[1] > c.TABLE_LENGTH / 2)
-            return far, np.isfinite(log.landing).all(axis=0) & ~log.returned.astype(bool)
-
-        return self._ball_share(model, of_level(group), choose)
-
-    def middle_share(self, model: str, player: str, touched: bool = False) -> Estimate | None:
-        """Share of the balls that bounce in the middle ninth of the robot's half; touched: by the robot."""
-
-        def choose(log: BallLog) -> tuple[np.ndarray, np.ndarray]:
-            x, y = log.landing
-            inside = (np.abs(x) <= c.TABLE_WIDTH / 6) & (np.abs(y + c.TABLE_LENGTH / 4) <= c.TABLE_LENGTH / 12)
-            return inside, np.isfinite(x) & np.isfinite(y) & (log.hit.astype(bool) | (not touched))
-
-        return self._ball_share(model, (player,), choose)
-
     def model_change(self, group: str = "all") -> Interval | None:
         """Second change of the human model over the first, over the players of a group."""
         return model_change(self.changes, group)
@@ -205,25 +182,6 @@ class Measurements:
     def _finite(self, rallies: Rallies, values: np.ndarray) -> Bootstrap:
         good = np.isfinite(values)
         return Bootstrap(rallies.take(good), values[good], longest=True)
-
-    def _ball_share(
-        self, model: str, trainers: Iterable[str], choose: Callable[[BallLog], tuple[np.ndarray, np.ndarray]]
-    ) -> Estimate | None:
-        """A share of the balls of own evaluations, all seeds together; whole rallies are drawn anew.
-
-        choose: of a log, which balls are in the share, and which are counted at all, both (n,) bool.
-        """
-        tables = []
-        for log in (log for trainer in trainers for log in self.study.logs(trainer, model)):
-            inside, counted = choose(log)
-            _, rally = np.unique(log.rally, return_inverse=True)
-            tables.append(np.array([np.bincount(rally, inside & counted), np.bincount(rally, counted)]))
-        table = np.concatenate(tables, axis=1) if tables else np.zeros((2, 0))
-        if not table[1].sum():
-            return None
-        drawn = table[:, np.random.default_rng(0).integers(0, table.shape[1], (DRAWS, table.shape[1]))].sum(axis=2)
-        share = float(table[0].sum() / table[1].sum())
-        return Estimate(share, drawn[0] / np.maximum(drawn[1], 1), int(table[1].sum()))
 
 
 def model_change(changes: Changes, group: str = "all") -> Interval | None:

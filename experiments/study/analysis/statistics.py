@@ -1,6 +1,6 @@
 """Means, differences and ratios of rally lengths with 95 % intervals, and normalised rally lengths.
 
-Student's t over the pooled rallies is the paper's way. The bootstrap draws rallies anew within each policy, and the
+The bootstrap draws rallies anew within each policy, and the
 study's repetitions (seeds) as well, so that its interval holds for a policy that is trained again; players are always
 the same ones. Of fewer than FEWEST_SEEDS seeds it would draw a handful of points, which are no 95 %: there it draws
 rallies alone.
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experiments.stats import t_interval, welch_interval, welch_p
+from experiments.stats import t_interval
 from experiments.study.analysis.scoring import Rallies, count_reported
 
 DRAWS = 2000
@@ -229,32 +229,6 @@ def t_mean(values: ArrayLike) -> Interval:
     if values.size < 2:
         return Interval(float(values.mean()) if values.size else float("nan"), -np.inf, np.inf, values.size)
     return Interval(*t_interval(values), values.size)
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean of one model minus that of another: the bootstrap's interval, and the paper's way, Welch's t over rallies.
-
-    p: two-sided, of Welch's t; it takes rallies as independent, so it holds for these very policies
-    """
-
-    bootstrap: Interval
-    welch: Interval
-    p: float
-
-
-def compare_models(boot: Bootstrap, a: str, b: str, trainers: Iterable[str]) -> Difference | None:
-    """Of model ``a`` minus model ``b``, over own evaluations of trainers and seeds that have both; None without any."""
-    trainers = tuple(trainers)
-    both = boot.pair(a, b, trainers)
-    if both is None:
-        return None
-    paired = [c for c in boot.cells if c[3] == a and c[1] == c[2] and c[1] in trainers and (*c[:3], b) in boot.cells]
-    first, second = (np.concatenate([boot.cells[(*c[:3], model)] for c in paired]) for model in (a, b))
-    if min(first.size, second.size) < 2:
-        return None
-    welch = Interval(*welch_interval(second, first), first.size + second.size)
-    return Difference((both[0] - both[1]).interval, welch, welch_p(first, second))
 
 
 def _is(own: bool | None, cell: Cell) -> bool:

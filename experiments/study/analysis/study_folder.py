@@ -1,13 +1,9 @@
-"""A study's folder as data: rallies, ball logs, human models; what is not there is named, not an error."""
+"""A study's folder as data: rallies, human models; what is not there is named, not an error."""
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +13,7 @@ import numpy as np
 from ballmodel import registry
 from ballmodel.distribution import AXES, BallDistribution, load_distribution
 from ballmodel.io.yaml import read as read_yaml
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, error_context
 from experiments.study.analysis import scoring
 from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, IDENTIFIED, IS2R, METHODS, TEN
 from experiments.study.analysis.statistics import Models
@@ -28,27 +24,6 @@ QUANTITIES = tuple(f"{part} {axis}" for part, axes in AXES.items() for axis in a
 """Quantities that a human model bounds: position and velocity at the start, landing point."""
 NUMBERS = tuple(f"{quantity} {end}" for quantity in QUANTITIES for end in ("min", "max"))
 """Names of the 16 numbers of a human model."""
-
-
-@dataclass(frozen=True)
-class BallLog:
-    """The human's balls of one evaluation, arrays with the n balls last.
-
-    rally: (n,) its rally; touch: (n,) the touch that hit it; first: (n,) bool, begins a rally;
-    position, velocity: (3, n) [m], [m/s] at the human's contact; landing: (2, n) [m] on the robot's side;
-    hit, returned: (n,) bool; return_landing: (2, n) [m] where the robot's return came down, not finite where there is
-    none
-    """
-
-    rally: np.ndarray
-    touch: np.ndarray
-    first: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    landing: np.ndarray
-    hit: np.ndarray
-    returned: np.ndarray
-    return_landing: np.ndarray
 
 
 @dataclass
@@ -102,18 +77,8 @@ class StudyFolder:
         for name in ROUNDS:
             path = self.paths.human(seed, player, name)
             if path.exists():
-                with _reading(path):
+                with error_context(str(path)):
                     found[name] = load_distribution(path)
-        return found
-
-    def logs(self, trainer: str, model: str) -> list[BallLog]:
-        """The logs of a policy with its own trainer, of all seeds that have one."""
-        found = []
-        for seed in self.seeds:
-            path = self.paths.evaluation_log(seed, trainer, trainer, model)
-            if path.exists():
-                with _reading(path), np.load(path, allow_pickle=False) as data:
-                    found.append(BallLog(**{f.name: data[f.name] for f in fields(BallLog)}))
         return found
 
     @cached_property
@@ -123,7 +88,7 @@ class StudyFolder:
         for seed in self.seeds:
             path = self.paths.seed(seed) / "reality.yaml"
             if path.exists():
-                with _reading(path):
+                with error_context(str(path)):
                     found[seed] = read_yaml(path)
         return found
 
@@ -175,7 +140,7 @@ def _settings(path: Path) -> dict[str, Any]:
     """A study's YAML; empty where there is none."""
     if not path.exists():
         return {}
-    with _reading(path):
+    with error_context(str(path)):
         content = read_yaml(path)
         if not isinstance(content, dict):
             raise ValueError(f"expected a mapping, got {type(content).__name__}")
@@ -222,14 +187,3 @@ def _known(rallies: scoring.Rallies) -> tuple[np.ndarray, list[str]]:
         if unknown:
             out.append(f"{column} {', '.join(unknown)} (known are {', '.join(sorted(known))})")
     return where, out
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Errors of reading a file become a ConfigError that names it."""
-    try:
-        yield
-    except (ValueError, KeyError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        lines = [line.removeprefix(f"{path}: ") for line in str(error).splitlines()]
-        text = "; ".join(lines) or type(error).__name__
-        raise ConfigError(f"{path}: cannot be read: {text}; restore the file") from None

@@ -1,21 +1,33 @@
-"""The paper's main figures with ours. ``FIGURES`` names them all.
+"""The paper's main figures with ours. ``FIGURES`` names them all; a figure is None where the study holds nothing of it.
 
-A figure is None where the study holds nothing of it.
+One colour per method everywhere (``paper.yaml``); paler where a model is not fine-tuned. White diamonds and hollow bars
+are the paper's. Boxes are the paper's: white circle the mean, line the median, box the quartiles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from experiments.study.analysis import paper
 from experiments.study.analysis.claims import RATIO, Measurements
+from experiments.study.analysis.statistics import Estimate, Interval
 from experiments.study.analysis.study_folder import QUANTITIES, ROUNDS, numbers, paper_models
-from experiments.study.report import plots
 from mjx_tt.viz.html import FAINT, INK
+from mjx_tt.viz.html import STYLE as PAGE_STYLE
 
+STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
+DIAMOND: dict[str, Any] = {"marker": "D", "color": INK, "markerfacecolor": "white", "linestyle": ""}
+MEAN = "mean rally length, 95 %"
+Colour = str | tuple[float, float, float]
 STAGES = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
 CURVES: dict[str, tuple[str | None, ...]] = {  # of each method at the stages
     paper.IS2R: tuple(model.key for model in paper.METHODS[paper.IS2R]),
@@ -35,11 +47,11 @@ def draw_summary(m: Measurements) -> Figure | None:
     figure = Figure(figsize=(10.5, 0.36 * len(shown) + 1.4))
     axes = figure.subplots()
     for row, f in enumerate(shown):
-        shade = plots.colour(f.claim.of["a"]) if "a" in f.claim.of else INK
+        shade = colour(f.claim.of["a"]) if "a" in f.claim.of else INK
         style = {"fmt": "o", "color": shade, "markersize": 6, "linewidth": 2, "capsize": 3}
-        axes.errorbar(f.interval.value, row, xerr=plots.error_lengths(f.interval), **style)
+        axes.errorbar(f.interval.value, row, xerr=error_lengths(f.interval), **style)
         if f.paper is not None:
-            axes.plot(f.paper, row, **plots.DIAMOND, markersize=7, zorder=6)
+            axes.plot(f.paper, row, **DIAMOND, markersize=7, zorder=6)
         axes.annotate(f.verdict, (1.01, row), xycoords=("axes fraction", "data"), va="center", fontsize=8.5, color=INK)
     axes.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
     axes.set_yticks(range(len(shown)), [f"{f.claim.key}: {f.claim.quantity}" for f in shown], fontsize=8)
@@ -62,13 +74,13 @@ def draw_methods(m: Measurements) -> Figure | None:
     figure = Figure(figsize=(13, 6.8))
     for group, (upper, lower) in zip(("all", *paper.LEVELS), figure.subplots(2, 4).T, strict=True):
         players = paper.of_level(group)
-        plots.draw_boxes(upper, [m.raw.pooled(key, players) for key in keys], keys)
-        upper.set_title(plots.group_label(group))
-        plots.draw_bars(lower, [[m.raw.mean(key, players)] for key in keys], [[key] for key in keys])
+        draw_boxes(upper, [m.raw.pooled(key, players) for key in keys], keys)
+        upper.set_title(group_label(group))
+        draw_bars(lower, [[m.raw.mean(key, players)] for key in keys], [[key] for key in keys])
         for axes in (upper, lower):
             axes.set_xticks(range(len(keys)), [paper.SHORT[key] for key in keys], fontsize=8, rotation=20)
     figure.axes[0].set_ylabel("rally length")
-    figure.axes[4].set_ylabel(plots.MEAN)
+    figure.axes[4].set_ylabel(MEAN)
     return figure
 
 
@@ -87,15 +99,15 @@ def draw_rounds(m: Measurements) -> Figure | None:
             shade, dashes = paper.COLOURS[method], "--" if method in (paper.FRESH, paper.S2R) else "-"
             for at, (i, mean) in found.items():
                 style = {"fmt": "o", "color": shade, "markerfacecolor": shade if i % 2 else "white", "capsize": 2.5}
-                axes.errorbar(at, mean.value, plots.error_lengths(mean), **style)
+                axes.errorbar(at, mean.value, error_lengths(mean), **style)
             axes.plot(list(found), [mean.value for _, mean in found.values()], dashes, color=shade, zorder=1)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=7)
         axes.set_ylim(bottom=0)
-        axes.set_title(plots.group_label(group))
+        axes.set_title(group_label(group))
         axes.grid(axis="y", alpha=0.25)
-        plots.note_empty(axes)
-    figure.axes[0].set_ylabel(plots.MEAN)
-    plots.add_legend(figure, [plots.line(paper.LEGEND[method], paper.COLOURS[method]) for method in shown])
+        note_empty(axes)
+    figure.axes[0].set_ylabel(MEAN)
+    add_legend(figure, [line(paper.LEGEND[method], paper.COLOURS[method]) for method in shown])
     return figure
 
 
@@ -121,8 +133,8 @@ def draw_evolution(m: Measurements) -> Figure | None:
         axes.margins(y=0.06)
         axes.set_ylabel(f"{quantity} [{'m/s' if quantity.startswith('velocity') else 'm'}]")
         axes.grid(axis="y", alpha=0.25)
-    handles = [plots.patch(f"{name}, here", HUMAN_MODEL_COLOURS[name]) for name in ROUNDS]
-    plots.add_legend(figure, [*handles, plots.patch("the paper's, beside it", "white", edgecolor=INK)])
+    handles = [patch(f"{name}, here", HUMAN_MODEL_COLOURS[name]) for name in ROUNDS]
+    add_legend(figure, [*handles, patch("the paper's, beside it", "white", edgecolor=INK)])
     return figure
 
 
@@ -137,18 +149,114 @@ def draw_cross(m: Measurements) -> Figure | None:
         (centre, m.cross_normalised, "Normalised by the trainer's own"),
     ):
         groups = [[boot.mean(key, m.study.players, own) for own in (True, False)] for key in paper.FINAL]
-        plots.draw_bars(axes, groups, [[key] * 2 for key in paper.FINAL], hatches=(None, "///"))
+        draw_bars(axes, groups, [[key] * 2 for key in paper.FINAL], hatches=(None, "///"))
         axes.set_title(title)
-    plots.draw_bars(right, [[m.kept_ratio([key])] for key in paper.FINAL], [[key] for key in paper.FINAL])
+    draw_bars(right, [[m.kept_ratio([key])] for key in paper.FINAL], [[key] for key in paper.FINAL])
     for k, key in enumerate(("keeps-is2r", "keeps-s2r")):
-        right.plot(k + 0.38, m.findings[key].paper, **plots.DIAMOND)
+        right.plot(k + 0.38, m.findings[key].paper, **DIAMOND)
     right.axhline(1.0, color=FAINT, linewidth=0.8)
     right.set_title("Kept with other players")
     for axes in (left, centre, right):
         axes.set_xticks(range(len(paper.FINAL)), [paper.SHORT[key] for key in paper.FINAL], fontsize=8.5)
-    hatched = plots.patch("other players", "#aaaaaa", hatch="///", edgecolor="white")
-    plots.add_legend(figure, [plots.patch("own trainer", "#aaaaaa"), hatched, plots.line("paper", **plots.DIAMOND)])
+    hatched = patch("other players", "#aaaaaa", hatch="///", edgecolor="white")
+    add_legend(figure, [patch("own trainer", "#aaaaaa"), hatched, line("paper", **DIAMOND)])
     return figure
+
+
+def colour(key: str) -> tuple[float, float, float]:
+    """Colour of a model: its method's, paler where it is not fine-tuned."""
+    model = paper.BY_KEY[key]
+    rgb = to_rgb(paper.COLOURS[model.method])
+    pale = not model.fine_tuned and model.method != paper.ABLATION
+    red, green, blue = (share + 0.55 * (1.0 - share) if pale else share for share in rgb)
+    return red, green, blue
+
+
+def group_label(group: str) -> str:
+    """A group of players, for titles."""
+    if group == "all":
+        return "All players"
+    chosen = paper.of_level(group)
+    return f"{group.capitalize()}: player{'s' if len(chosen) > 1 else ''} {', '.join(p[-1] for p in chosen)}"
+
+
+def error_lengths(interval: Interval) -> list[list[float]]:
+    """Lengths (2, 1) of an error bar below and above the value; zero where there is no interval."""
+    below, above = interval.value - interval.low, interval.high - interval.value
+    return [[max(x, 0.0) if np.isfinite(x) else 0.0] for x in (below, above)]
+
+
+def draw_bars(
+    axes: Axes,
+    groups: Sequence[Sequence[Estimate | None]],
+    keys: Sequence[Sequence[str]],
+    hatches: Sequence[str | None] | None = None,
+) -> None:
+    """Groups of bars with their intervals, a group at each of 0, 1, 2 ... on the x axis.
+
+    groups, keys: values and their models, by group and by bar within it; hatches: by bar within a group. A missing
+    value leaves a gap.
+    """
+    for x, (group, models) in enumerate(zip(groups, keys, strict=True)):
+        width = 0.8 / len(group)
+        for k, (measured, key) in enumerate(zip(group, models, strict=True)):
+            if measured is None:
+                continue
+            at, hatch = x + (k - 0.5 * (len(group) - 1)) * width, hatches and hatches[k]
+            edge: dict[str, Any] = {"hatch": hatch, "edgecolor": "white"} if hatch else {}
+            axes.bar(at, measured.value, 0.95 * width, color=colour(key), linewidth=0, **edge)
+            lengths = error_lengths(measured.interval)
+            axes.errorbar(at, measured.value, lengths, color=INK, linewidth=1.1, capsize=2.5)
+    note_empty(axes)
+    axes.axhline(0.0, color=FAINT, linewidth=0.8)
+
+
+def draw_boxes(axes: Axes, samples: Sequence[np.ndarray], keys: Sequence[str]) -> None:
+    """A box plot of rally lengths for every model, on a log scale. samples: (n,) of each key, empty without any."""
+    for k, (values, key) in enumerate(zip(samples, keys, strict=True)):
+        if values.size:
+            axes.boxplot(
+                values,
+                positions=[k],
+                widths=0.62,
+                patch_artist=True,
+                showmeans=True,
+                manage_ticks=False,
+                boxprops={"facecolor": colour(key)},
+                medianprops={"color": INK},
+                meanprops={"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK},
+                flierprops={"marker": ".", "markersize": 2.5},
+            )
+    note_empty(axes)
+    axes.set_yscale("log")
+    ticks = (1, 2, 5, 10, 20, 50, 100, 200, 400)
+    axes.set_yticks(ticks, [str(t) for t in ticks])
+    axes.set_ylim(1.0, 1.3 * max([float(v.max()) for v in samples if v.size], default=2.0))
+    axes.minorticks_off()
+
+
+def note_empty(axes: Axes) -> None:
+    """Says that the study has nothing to draw, where nothing was drawn."""
+    if not axes.has_data():
+        axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
+
+
+def add_legend(figure: Figure, handles: Iterable[Artist], place: str = "center", **options: Any) -> None:
+    """A legend below the axes."""
+    handles = list(handles)
+    settings: dict[str, Any] = {"ncols": len(handles) or 1, "loc": f"outside lower {place}"} | options
+    figure.legend(handles=handles, **settings)
+
+
+def patch(label: str, shade: Colour, **options: Any) -> Patch:
+    """An entry of a legend for an area."""
+    return Patch(facecolor=shade, label=label, **options)
+
+
+def line(label: str, shade: Colour = INK, **options: Any) -> Line2D:
+    """An entry of a legend for a line or, with a marker, for points."""
+    options = {"color": shade, "label": label} | options
+    return Line2D([], [], **options)
 
 
 FIGURES: dict[str, Callable[[Measurements], Figure | None]] = {

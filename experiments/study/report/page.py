@@ -19,7 +19,6 @@ from experiments.study.analysis.statistics import FEWEST_SEEDS, name_chance
 from experiments.study.analysis.study_folder import StudyFolder, load
 from experiments.study.paths import REPORT
 from experiments.study.report import figures, tables
-from experiments.study.report.plots import STYLE
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.viz.html import Page, details, environment, table
 
@@ -56,7 +55,7 @@ def compose(study: StudyFolder) -> tuple[Page, dict[str, tables.Table]]:
 
     def picture(name: str, caller: Callable[[], Markup]) -> Markup:
         caption = " ".join(caller().unescape().split())
-        with matplotlib.rc_context(STYLE):
+        with matplotlib.rc_context(figures.STYLE):
             figure = figures.FIGURES[name](measured)
         if figure is None:
             return Markup("<p>{} {}: this study holds nothing of it.</p>").format(_badge(NOT_COMPARABLE), name)

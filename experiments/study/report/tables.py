@@ -12,10 +12,9 @@ import numpy as np
 
 from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
-from experiments.study.analysis.claims import DIFFERENCE, HITS, Measurements, paper_changes, show, show_interval
+from experiments.study.analysis.claims import HITS, Measurements, paper_changes, show, show_interval
 from experiments.study.analysis.identified import holds, list_estimates
 from experiments.study.analysis.paper import BY_KEY, CROSS, FINAL, GROUPS, SHORT, TEN, level, of_level
-from experiments.study.analysis.statistics import compare_models
 from experiments.study.analysis.study_folder import StudyFolder
 from mjx_tt.rally.end_reasons import ROWS
 from mjx_tt.sim.model import ModelFile
@@ -131,21 +130,6 @@ def tabulate_ends(m: Measurements) -> Table:
     return Table(head, rows, range(3, 7))
 
 
-def tabulate_significance(m: Measurements) -> Table:
-    """Differences between the final models in every group, raw and normalised, by bootstrap and by Welch's t."""
-    is2r, s2r, oracle = FINAL
-    rows = []
-    for group in GROUPS:
-        for scale, boot in (("raw", m.raw), ("normalised", m.normalised)):
-            for a, b in ((is2r, s2r), (is2r, oracle), (oracle, s2r)):
-                if (d := compare_models(boot, a, b, of_level(group))) is not None:
-                    spans = (show_interval(DIFFERENCE, d.bootstrap), show_interval(DIFFERENCE, d.welch))
-                    label, p = f"{SHORT[a]} − {SHORT[b]}", "< 0.001" if d.p < 0.001 else f"{d.p:.3f}"
-                    rows.append((group, scale, label, f"{d.bootstrap.value:+.2f}", *spans, p))
-    head = ("players", "scale", "difference", "mean", "95 %", "95 %, Welch", "p Welch")
-    return Table(head, rows, range(3, len(head)))
-
-
 def tabulate_models(m: Measurements) -> Table:
     """Rally length of every model in every group of players."""
     rows = []
@@ -172,7 +156,6 @@ TABLES: dict[str, Callable[[Measurements], Table]] = {
     "coverage": tabulate_coverage,
     "identified": tabulate_identified,
     "ends": tabulate_ends,
-    "significance": tabulate_significance,
 }
 
 

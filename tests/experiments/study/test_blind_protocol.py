@@ -30,8 +30,7 @@ def test_codes_are_one_to_one_and_the_order_is_random():
         for place, model in enumerate(key):
             places["abcd".index(model), place] += 1
     assert chisquare(places.ravel()).pvalue > 1e-3
-    assert blind_protocol.list_codes(28)[-3:] == ("Z", "AA", "AB")
-    with pytest.raises(ValueError, match="each model once"):
+    with pytest.raises(ValueError, match="expected each model once"):
         blind_protocol.draw(["a", "a"], rng)
 
 
