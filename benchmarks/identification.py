@@ -132,10 +132,10 @@ def of_reality(
     counts = {}
     for name, hits in (("identified", ()), ("hits", (folder / "hits",))):
         began = time.monotonic()
-        found = identification.identify(logs, 400, ModelFile(SimModel()), prior, hits)
-        seconds[name], worlds[name] = time.monotonic() - began, found.world
-        counts[name] = found.hits
-        found.world.save(folder / f"{name}.yaml")
+        world = identification.identify(logs, 400, ModelFile(SimModel()), prior, hits)
+        seconds[name], worlds[name] = time.monotonic() - began, world
+        counts[name] = (world.provenance or {})["identified"]["hits"]
+        world.save(folder / f"{name}.yaml")
     worlds["truth"] = ModelFile(add_spin(reality, player, keys[6]))
     base = {
         "seed": seed,

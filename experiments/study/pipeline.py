@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -22,13 +21,12 @@ from ballmodel.trajectory import Dataset
 from experiments import measurements
 from experiments.config import build
 from experiments.config.study import RIG, Identification, Study
-from experiments.errors import RunError, error_context
+from experiments.errors import error_context
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
-from experiments.study import blind_protocol, evaluation, identification, training
+from experiments.study import evaluation, identification, training
 from experiments.study.analysis import scoring
-from experiments.study.analysis.identified import list_estimates
 from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import (
     Human,
@@ -77,10 +75,8 @@ class Pipeline:
 
     def _steps_of_seed(self, seed: int) -> list[Step]:
         study, found = self.study, []
-        if study.robot is None:
-            found.append(self._seal_reality(seed))
-            if study.identification is not None:
-                found.append(self._log_joints(seed, study.identification.seconds))
+        if study.robot is None and study.identification is not None:
+            found.append(self._log_joints(seed, study.identification.seconds))
         for player in study.players:
             found.append(self._first_balls(seed, player))
             found += [self._make_item(seed, player, item) for item in list_items(study, player)]
@@ -92,31 +88,16 @@ class Pipeline:
 
     # -- realities and worlds
 
-    def _reality(self, seed: int) -> dict[str, Any]:
-        """Content that is sealed: the reality as plain data."""
-        without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
-        return hidden_effects.describe(hidden_effects.draw(seed, without, outside), seed, without, outside)
-
-    def _seal_reality(self, seed: int) -> Step:
-        path = self.paths.seed(seed) / "reality.sealed"
-
-        def run() -> str:
-            return f"sealed with SHA-256 {blind_protocol.seal(path, self._reality(seed))[:16]}..."
-
-        return Step(f"seed{seed}/reality", (), (path,), run)
-
     def _open_reality(self, seed: int) -> Step:
-        sealed, path = (self.paths.seed(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
-        inputs = (sealed, self.paths.folder / EVALUATIONS)
+        path, settings = self.paths.seed(seed) / "reality.yaml", self.study.reality
 
         def run() -> str:
-            content = blind_protocol.unseal(sealed)
-            if content != self._reality(seed):
-                raise RunError(f"{sealed}: holds another reality than the one of seed {seed} in which was played")
-            run_dir.write_yaml(path, content)
+            without, outside = tuple(settings.without), tuple(settings.outside)
+            model = hidden_effects.draw(seed, without, outside)
+            run_dir.write_yaml(path, hidden_effects.describe(model, seed, without, outside))
             return "opened"
 
-        return Step(f"seed{seed}/reality opened", inputs, (path,), run)
+        return Step(f"seed{seed}/reality", (self.paths.folder / EVALUATIONS,), (path,), run)
 
     def _log_joints(self, seed: int, seconds: float) -> Step:
         folder, name = self.paths.seed(seed) / JOINTS, f"seed{seed}/{JOINTS}"
@@ -175,13 +156,13 @@ class Pipeline:
             believed = build.believed(self.study.simulation.model)
             prior = identification.read_prior(settings.prior, "identification.prior")
             with error_context(name):
-                found = identification.identify(
+                world = identification.identify(
                     [*data, *motion], settings.balls, believed, prior, hits, settings.seconds
                 )
-            found.world.save(path)
-            count = len(list_estimates(found.world))
-            doubt = "" if found.settled else "; the balls' fit did not settle: its intervals are wider by its last step"
-            return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn{doubt}"
+            world.save(path)
+            made_of = (world.provenance or {})["identified"]
+            doubt = "" if made_of["settled"] else "; the balls' fit did not settle: its intervals are wider by its step"
+            return f"{made_of['flights']} flights, {made_of['hits']} hits{doubt}"
 
         inputs = (*data, *motion, *(folder / identification.BALLS for folder in hits))
         return Step(name, inputs, (path,), run)

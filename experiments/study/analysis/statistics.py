@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import ArrayLike
 
 from experiments.stats import t_interval
@@ -20,7 +20,8 @@ from experiments.study.analysis.scoring import Rallies, count_reported
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
-Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
+CELL = ["seed", "trainer", "evaluator", "model"]
+Cell = tuple[int, str, str, str]
 Models = str | Iterable[str]  # one or several
 
 
@@ -100,13 +101,16 @@ class Bootstrap:
         rng = np.random.default_rng(key)
         reported = rallies.selected if longest else np.ones(len(rallies), bool)
         self.cells = group_by_cell(rallies.take(reported), values[reported])
-        self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         pooled = rallies.pooled if longest else reported
         order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
-        self._draws: dict[Cell, Any] = {
+        drawn = {
             cell: _means(v, count_reported(v.size) if longest else v.size, draws, rng)
             for cell, v in group_by_cell(rallies.take(order), values[order]).items()
         }
+        # A row for each cell: its mean, then the draws of it.
+        rows = [np.append(self.cells[cell].mean(), means) for cell, means in drawn.items()]
+        index = pandas.MultiIndex.from_tuples(drawn, names=CELL) if drawn else None
+        self._table = pandas.DataFrame(rows, index)
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
         seeds = len({cell[0] for cell in self.cells})
         self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, seeds + 1)}
@@ -145,20 +149,10 @@ class Bootstrap:
         return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
 
     def _mean(self, found: list[Cell]) -> Estimate:
-        """Mean over cells, at least one."""
-        groups: dict[int, dict[str, list[Cell]]] = {}
-        for cell in found:
-            groups.setdefault(cell[0], {}).setdefault(cell[1], []).append(cell)
-        points, draws = (
-            np.array(
-                [
-                    np.mean([np.mean([table[c] for c in members], axis=0) for members in by_trainer.values()], axis=0)
-                    for by_trainer in groups.values()
-                ]
-            )
-            for table in (self.point, self._draws)
-        )
-        chosen = self._chosen.get(len(groups))
+        """Mean over the cells (at least one) of a trainer, then over trainers, then over seeds."""
+        by_seed = self._table.loc[found].groupby(level=["seed", "trainer"]).mean().groupby(level="seed").mean()
+        points, draws = by_seed.iloc[:, 0].to_numpy(), by_seed.iloc[:, 1:].to_numpy()
+        chosen = self._chosen.get(len(draws))
         drawn = draws.mean(axis=0) if chosen is None else np.take_along_axis(draws, chosen, axis=0).mean(axis=0)
         return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))
 
@@ -173,11 +167,8 @@ def _means(values: np.ndarray, first: int, draws: int, rng: np.random.Generator)
 
 def group_by_cell(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
-    groups: dict[Cell, list[int]] = {}
-    columns = (getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model"))
-    for i, cell in enumerate(zip(*columns, strict=True)):
-        groups.setdefault(cell, []).append(i)
-    return {cell: values[index] for cell, index in groups.items()}
+    keys = [getattr(rallies, name) for name in CELL]
+    return {cell: group.to_numpy() for cell, group in pandas.Series(values).groupby(keys, sort=False)}
 
 
 def normalise_by_player(rallies: Rallies) -> np.ndarray:
@@ -200,13 +191,10 @@ def normalise_by_model(rallies: Rallies) -> np.ndarray:
 
 def _standardise(rallies: Rallies, group: Sequence[str], reference: np.ndarray) -> np.ndarray:
     """(n,) lengths standardised by the reference rallies, (n,) bool, of their group."""
-    out, columns = np.full(len(rallies), np.nan), [getattr(rallies, name) for name in group]
-    for names in set(zip(*(column.tolist() for column in columns), strict=True)):
-        members = np.all([column == name for column, name in zip(columns, names, strict=True)], axis=0)
-        base = rallies.length[members & reference].astype(float)
-        if base.size > 1 and base.std(ddof=1) > 0.0:
-            out[members] = (rallies.length[members] - base.mean()) / base.std(ddof=1)
-    return out
+    length, keys = pandas.Series(rallies.length.astype(float)), [getattr(rallies, name) for name in group]
+    base = length.where(reference).groupby(keys)
+    spread = base.transform("std")
+    return ((length - base.transform("mean")) / spread.where(spread > 0.0)).to_numpy()
 
 
 def average_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:

@@ -22,8 +22,6 @@ from experiments.study.paths import EVALUATIONS, SETTINGS, StudyPaths
 ROUNDS = ("M0", "M1", "M2")
 QUANTITIES = tuple(f"{part} {axis}" for part, axes in AXES.items() for axis in axes)
 """Quantities that a human model bounds: position and velocity at the start, landing point."""
-NUMBERS = tuple(f"{quantity} {end}" for quantity in QUANTITIES for end in ("min", "max"))
-"""Names of the 16 numbers of a human model."""
 
 
 @dataclass
@@ -94,7 +92,7 @@ class StudyFolder:
 
 
 def numbers(distribution: BallDistribution) -> np.ndarray:
-    """(16,) the numbers of a human model in the order of NUMBERS."""
+    """(16,) the numbers of a human model: of each of QUANTITIES minimum and maximum."""
     ends = [[v for part in AXES for v in getattr(distribution, f"{part}_{end}")] for end in ("min", "max")]
     return np.array(ends).T.ravel()
 

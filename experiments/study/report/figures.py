@@ -6,7 +6,7 @@ are the paper's. Boxes are the paper's: white circle the mean, line the median, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,6 @@ from mjx_tt.viz.html import STYLE as PAGE_STYLE
 STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 DIAMOND: dict[str, Any] = {"marker": "D", "color": INK, "markerfacecolor": "white", "linestyle": ""}
 MEAN = "mean rally length, 95 %"
-Colour = str | tuple[float, float, float]
 STAGES = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
 CURVES: dict[str, tuple[str | None, ...]] = {  # of each method at the stages
     paper.IS2R: tuple(model.key for model in paper.METHODS[paper.IS2R]),
@@ -76,7 +75,7 @@ def draw_methods(m: Measurements) -> Figure | None:
         players = paper.of_level(group)
         draw_boxes(upper, [m.raw.pooled(key, players) for key in keys], keys)
         upper.set_title(group_label(group))
-        draw_bars(lower, [[m.raw.mean(key, players)] for key in keys], [[key] for key in keys])
+        draw_bars(lower, [m.raw.mean(key, players) for key in keys], keys)
         for axes in (upper, lower):
             axes.set_xticks(range(len(keys)), [paper.SHORT[key] for key in keys], fontsize=8, rotation=20)
     figure.axes[0].set_ylabel("rally length")
@@ -107,7 +106,7 @@ def draw_rounds(m: Measurements) -> Figure | None:
         axes.grid(axis="y", alpha=0.25)
         note_empty(axes)
     figure.axes[0].set_ylabel(MEAN)
-    add_legend(figure, [line(paper.LEGEND[method], paper.COLOURS[method]) for method in shown])
+    add_legend(figure, [Line2D([], [], color=paper.COLOURS[k], label=paper.LEGEND[k]) for k in shown])
     return figure
 
 
@@ -133,33 +132,8 @@ def draw_evolution(m: Measurements) -> Figure | None:
         axes.margins(y=0.06)
         axes.set_ylabel(f"{quantity} [{'m/s' if quantity.startswith('velocity') else 'm'}]")
         axes.grid(axis="y", alpha=0.25)
-    handles = [patch(f"{name}, here", HUMAN_MODEL_COLOURS[name]) for name in ROUNDS]
-    add_legend(figure, [*handles, patch("the paper's, beside it", "white", edgecolor=INK)])
-    return figure
-
-
-def draw_cross(m: Measurements) -> Figure | None:
-    """Own and cross-evaluations: mean length, mean normalised length, share that is kept (main_cross_eval_summary)."""
-    if not any(cell[1] != cell[2] for cell in m.raw.cells):
-        return None
-    figure = Figure(figsize=(11, 3.9))
-    left, centre, right = figure.subplots(1, 3)
-    for axes, boot, title in (
-        (left, m.raw, "Mean rally length"),
-        (centre, m.cross_normalised, "Normalised by the trainer's own"),
-    ):
-        groups = [[boot.mean(key, m.study.players, own) for own in (True, False)] for key in paper.FINAL]
-        draw_bars(axes, groups, [[key] * 2 for key in paper.FINAL], hatches=(None, "///"))
-        axes.set_title(title)
-    draw_bars(right, [[m.kept_ratio([key])] for key in paper.FINAL], [[key] for key in paper.FINAL])
-    for k, key in enumerate(("keeps-is2r", "keeps-s2r")):
-        right.plot(k + 0.38, m.findings[key].paper, **DIAMOND)
-    right.axhline(1.0, color=FAINT, linewidth=0.8)
-    right.set_title("Kept with other players")
-    for axes in (left, centre, right):
-        axes.set_xticks(range(len(paper.FINAL)), [paper.SHORT[key] for key in paper.FINAL], fontsize=8.5)
-    hatched = patch("other players", "#aaaaaa", hatch="///", edgecolor="white")
-    add_legend(figure, [patch("own trainer", "#aaaaaa"), hatched, line("paper", **DIAMOND)])
+    handles = [Patch(facecolor=HUMAN_MODEL_COLOURS[name], label=f"{name}, here") for name in ROUNDS]
+    add_legend(figure, [*handles, Patch(facecolor="white", edgecolor=INK, label="the paper's, beside it")])
     return figure
 
 
@@ -186,27 +160,13 @@ def error_lengths(interval: Interval) -> list[list[float]]:
     return [[max(x, 0.0) if np.isfinite(x) else 0.0] for x in (below, above)]
 
 
-def draw_bars(
-    axes: Axes,
-    groups: Sequence[Sequence[Estimate | None]],
-    keys: Sequence[Sequence[str]],
-    hatches: Sequence[str | None] | None = None,
-) -> None:
-    """Groups of bars with their intervals, a group at each of 0, 1, 2 ... on the x axis.
-
-    groups, keys: values and their models, by group and by bar within it; hatches: by bar within a group. A missing
-    value leaves a gap.
-    """
-    for x, (group, models) in enumerate(zip(groups, keys, strict=True)):
-        width = 0.8 / len(group)
-        for k, (measured, key) in enumerate(zip(group, models, strict=True)):
-            if measured is None:
-                continue
-            at, hatch = x + (k - 0.5 * (len(group) - 1)) * width, hatches and hatches[k]
-            edge: dict[str, Any] = {"hatch": hatch, "edgecolor": "white"} if hatch else {}
-            axes.bar(at, measured.value, 0.95 * width, color=colour(key), linewidth=0, **edge)
-            lengths = error_lengths(measured.interval)
-            axes.errorbar(at, measured.value, lengths, color=INK, linewidth=1.1, capsize=2.5)
+def draw_bars(axes: Axes, means: Sequence[Estimate | None], keys: Sequence[str]) -> None:
+    """A bar with its interval for every model; a missing one leaves a gap."""
+    for k, (mean, key) in enumerate(zip(means, keys, strict=True)):
+        if mean is not None:
+            axes.bar(k, mean.value, 0.76, color=colour(key), linewidth=0)
+            lengths = error_lengths(mean.interval)
+            axes.errorbar(k, mean.value, lengths, color=INK, linewidth=1.1, capsize=2.5)
     note_empty(axes)
     axes.axhline(0.0, color=FAINT, linewidth=0.8)
 
@@ -241,22 +201,9 @@ def note_empty(axes: Axes) -> None:
         axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
 
 
-def add_legend(figure: Figure, handles: Iterable[Artist], place: str = "center", **options: Any) -> None:
+def add_legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """A legend below the axes."""
-    handles = list(handles)
-    settings: dict[str, Any] = {"ncols": len(handles) or 1, "loc": f"outside lower {place}"} | options
-    figure.legend(handles=handles, **settings)
-
-
-def patch(label: str, shade: Colour, **options: Any) -> Patch:
-    """An entry of a legend for an area."""
-    return Patch(facecolor=shade, label=label, **options)
-
-
-def line(label: str, shade: Colour = INK, **options: Any) -> Line2D:
-    """An entry of a legend for a line or, with a marker, for points."""
-    options = {"color": shade, "label": label} | options
-    return Line2D([], [], **options)
+    figure.legend(handles=handles, ncols=len(handles), loc="outside lower center")
 
 
 FIGURES: dict[str, Callable[[Measurements], Figure | None]] = {
@@ -264,5 +211,4 @@ FIGURES: dict[str, Callable[[Measurements], Figure | None]] = {
     "methods": draw_methods,
     "rounds": draw_rounds,
     "evolution": draw_evolution,
-    "cross": draw_cross,
 }

@@ -91,7 +91,7 @@ def tabulate_identified(m: Measurements) -> Table:
     rows = []
     for seed, player, name, row in _estimates(m.study):
         held, known = holds(row), row.get("truth")
-        truth = f"{known:.4g}" if known is not None else "" if seed in m.study.realities else "sealed"
+        truth = f"{known:.4g}" if known is not None else "" if seed in m.study.realities else "not opened"
         values = (f"{row[key]:.4g}" for key in ("believed", "low", "high"))
         inside = {None: "", True: "yes", False: "no"}[held]
         rows.append((str(seed), player, name, row["parameter"], row["decided by"], *values, truth, inside))

@@ -5,8 +5,7 @@ left out keeps what training believes. The draw depends on the seed and on the p
 effect changes no other. Balls spin as the player hits them; training believes that none does. Effects from outside of
 the model's class are added only where a study names them.
 
-What was drawn is sealed (``study.blind_protocol``) when a study begins and opened when it is over. The learner gets
-measured balls and rewards.
+What was drawn is written down when a study is over. The learner gets measured balls and rewards.
 """
 
 from __future__ import annotations
@@ -127,7 +126,7 @@ def list_differences(model: SimModel) -> dict[str, float]:
 
 
 def describe(model: SimModel, seed: int, without: tuple[str, ...], outside: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Content to be sealed: plain data."""
+    """The reality as plain data."""
     found: dict[str, Any] = {"seed": seed, "without": list(without), "reality": list_differences(model)}
     return found | ({"outside": list(outside)} if outside else {})
 

@@ -515,8 +515,6 @@ def test_a_study_leaves_what_it_says(finished):
     opened = (finished / "seed0" / "reality.yaml").read_text()
     drawn = hidden_effects.draw(0, ("drives", "encoders"))
     assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
-    assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
-    assert blind_protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
 
 
 @pytest.mark.slow

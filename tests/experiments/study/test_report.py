@@ -283,7 +283,6 @@ def test_a_study_of_chosen_methods_is_whole_and_says_what_identification_brings(
     for key, ratio in (("identified-zero-shot", 4.5), ("identified-tuned", 2.5)):
         found = m.findings[key].interval
         assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
-    assert figures.draw_cross(m) is None  # not bars of the own players alone
     for axes in figures.draw_methods(m).axes:  # no empty place for a method that was left out
         assert [label.get_text() for label in axes.get_xticklabels()] == ["i-S2R", "identified"]
     (tmp_path / "study.yaml").write_text("name: whole\n")  # where all was asked for, it is missing
