@@ -116,17 +116,18 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"player": ["player3"]}, "player: expected .*; did you mean 'players'"),
         ({"players": ["player3", "player3"]}, "different entries"),
-        ({"players": ["anna"]}, "got 'anna'"),
         ({"reality": {"without": ["magic"]}}, "got 'magic'"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
         ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
         ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
+        (
+            {"evaluation": {"rallies": 80, "lanes": 7}},
+            "no multiple of its lanes 7 .*the nearest that is allowed: 77 or 84",
+        ),
+        ({"ablation": {"player": "player4"}}, "ablation.player 'player4' is none of the players of this study"),
         ({"identification": {"joints": "logs"}}, "identification.joints: the virtual reality records its own"),
         ({"baselines": False, "identification": {}}, "evaluation.cross: .* and baselines is false; leave it out"),
-        ({"baselines": "is2r", "identification": {}}, "evaluation.cross: .* and baselines is is2r; leave it out"),
-        ({"baselines": "s2r"}, "baselines: expected .*is2r.*, got 's2r'"),
         (
             {"baselines": False, "evaluation": {"rallies": 50, "lanes": 5, "cross": False}},
             "leaves nothing to do without identification",
@@ -135,42 +136,14 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
             {"simulation": {"optimiser": {"gradient": "first_order"}, "rounds": LATER}},
             "simulation.rounds.1.later_rewards: simulation.optimiser.gradient first_order climbs an objective of its",
         ),
-        ({"identification": {"second": 5}}, "identification.second: expected .*; did you mean 'seconds'"),
         ({"fine_tuning": {"rewards": "sim"}}, "rewards: expected weights based on real, got sim"),
         ({"fine_tuning": {"seed": 3}}, "test: fine_tuning.seed 3: each step's chance follows from its name"),
-        ({"robot": "rig", "fine_tuning": {"seed": 3}}, "test: fine_tuning.seed 3"),
         ({"fine_tuning": {"evaluation_balls": 20}}, "test: fine_tuning.evaluation_balls 20: played on a robot alone"),
     ],
 )
 def test_mistakes_in_a_study_are_named(changes, message):
     with pytest.raises(ConfigError, match=message):
         study(**changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        (
-            {"evaluation": {"rallies": 80, "lanes": 7}},
-            "test: evaluation.rallies 80 is no multiple of its lanes 7 (evaluation.lanes); "
-            "the nearest that is allowed: 77 or 84",
-        ),
-        (
-            {"evaluation": {"rallies": 50, "lanes": 7}},
-            "test: evaluation.rallies 50 is no multiple of its lanes 7 (evaluation.lanes); "
-            "the nearest that is allowed: 56",
-        ),
-        (
-            {"ablation": {"player": "player4"}},
-            "test: ablation.player 'player4' is none of the players of this study; "
-            "allowed: player3, or no ablation at all (ablation: null)",
-        ),
-    ],
-)
-def test_a_mistake_across_keys_names_them_and_no_more(changes, text):
-    with pytest.raises(ConfigError) as raised:
-        study(**changes)
-    assert str(raised.value) == text
 
 
 @pytest.mark.parametrize(
@@ -303,7 +276,7 @@ def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
         hidden_effects.draw(3, ("magic",))
 
 
-def test_realities_lie_to_both_sides_of_what_training_believes_and_within_the_prior():
+def test_ranges_of_realities_hold_what_training_believes_and_lie_within_the_prior():
     nominal = models.paths()
     for effect, ranges in hidden_effects.RANGES.items():
         for path, (low, high) in ranges.items():
@@ -311,10 +284,6 @@ def test_realities_lie_to_both_sides_of_what_training_believes_and_within_the_pr
             assert wide[0] <= low < high <= wide[1], path
             if effect != "noise":
                 assert low <= nominal[path] <= high, path
-    drawn = [models.paths(hidden_effects.draw(seed)) for seed in range(40)]
-    for path in ("ball.paddle.restitution", "ball.table.restitution", "ball.table.friction", "sensing.camera_scale"):
-        above = sum(values[path] > nominal[path] for values in drawn)
-        assert 8 < above < 32, path
 
 
 def test_effects_from_outside_come_on_top_and_change_no_other():
@@ -467,18 +436,6 @@ def test_steps_go_on_where_they_were_stopped_and_follow_what_is_made_anew(tmp_pa
         Journal(path)
 
 
-def test_who_does_the_steps(tmp_path):
-    many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
-    if jax.default_backend() == "cpu":
-        assert session.choose_processes(many, None, None) == len(os.sched_getaffinity(0))
-    assert session.choose_processes(many, 3, None) == 3
-    assert session.choose_processes(many, None, 2) == session.choose_processes(study(), None, None) == 1
-    with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
-    assert session.choose_processes(with_robot, None, None) == 1
-    with pytest.raises(ConfigError, match="--processes 2: with a robot .* allowed: 1"):
-        session.choose_processes(with_robot, 2, None)
-
-
 # The whole loop
 
 
@@ -543,7 +500,7 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
     command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
 
     def steps_done() -> list[str]:
-        return [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
+        return Journal(folder / "steps.jsonl").steps
 
     def start_and_end(sign: Path, number: int, *more: str) -> tuple[int, str]:
         """Exit status and message of a session that gets a signal when ``sign`` is there."""
@@ -586,12 +543,6 @@ def assert_same_bits(folder: Path, finished: Path) -> None:
                         np.testing.assert_array_equal(a[name], b[name], err_msg=f"{path}: {name}")
             else:
                 assert path.read_bytes() == mine.read_bytes(), path
-
-
-@pytest.mark.slow
-def test_a_folder_belongs_to_one_study(finished):
-    with pytest.raises(RunError, match="first_balls: the study has 60, now 61"):
-        session._open(study(first_balls=61), finished)
 
 
 # On a robot

@@ -90,17 +90,6 @@ def test_fewer_than_five_seeds_are_not_drawn_anew():
     assert [statistics.name_chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
 
 
-def test_the_interval_covers_as_often_as_it_says():
-    rng, truth, hits = np.random.default_rng(3), 12.0, 0
-    for k in range(300):
-        length = 1 + rng.geometric(1.0 / (truth - 1.0), (2, 60))
-        data = rallies({(0, f"player{i}", f"player{i}", "m"): x for i, x in enumerate(length)})
-        data = data.take(~data.filtered)
-        i = Bootstrap(data, draws=300, key=k).mean("m", ["player0", "player1"]).interval
-        hits += i.low <= truth <= i.high
-    assert 0.90 <= hits / 300 <= 0.98
-
-
 def test_trainers_weigh_the_same_and_only_pairs_are_compared():
     data = rallies(
         {
