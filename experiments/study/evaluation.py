@@ -17,21 +17,20 @@ from experiments.study.analysis import scoring
 from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
-from mjx_tt.rally.simulator import Box, RallyResult
+from mjx_tt.rally.simulator import Box
 
 EVALUATION = 7  # purpose of a key, beside those of experiments.config.build
-Pairings = Sequence[tuple[str, str, str]]  # trainer, evaluator, model
 
 
 def play(
     study: Study,
     reality: VirtualReality,
     seed: int,
-    pairings: Pairings,
+    pairings: Sequence[tuple[str, str, str]],
     policies: Sequence[Policy],
     balls: Sequence[Balls],
-) -> RallyResult:
-    """Rallies of each pairing in ``evaluation.lanes`` parallel sessions. Arrays are NumPy, sessions last.
+) -> scoring.Rallies:
+    """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` parallel sessions, in turn.
 
     balls: what each policy was trained for
     """
@@ -47,7 +46,12 @@ def play(
         box,
         settings.max_touches,
     )
-    return jax.tree.map(np.asarray, result)
+    # (rallies of a session, sessions of all pairings): those of a pairing count as one session.
+    each = zip(*(np.split(np.asarray(x), len(pairings), axis=1) for x in (result.length, result.end)), strict=True)
+    return scoring.join(
+        scoring.score_rallies(seed, *pairing, "", length.ravel(), end.ravel())
+        for pairing, (length, end) in zip(pairings, each, strict=True)
+    )
 
 
 def _stack(policies: Sequence[Policy], balls: Sequence[Balls], spread: Callable[[Array], Array]) -> tuple[Policy, Box]:
@@ -58,20 +62,3 @@ def _stack(policies: Sequence[Policy], balls: Sequence[Balls], spread: Callable[
 
     boxes = [Box.of(one) for one in balls]
     return jax.tree.map(stack, *policies), Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes)))
-
-
-def score(seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> scoring.Rallies:
-    """All rallies as scored lines; the sessions of a pairing count as one, their rallies in turn."""
-    parts = []
-    for i, pairing in enumerate(pairings):
-        mine = slice(i * sessions, (i + 1) * sessions)
-        parts.append(
-            scoring.score_rallies(seed, *pairing, "", result.length[:, mine].ravel(), result.end[:, mine].ravel())
-        )
-    return scoring.join(parts)
-
-
-def summarise(rallies: scoring.Rallies) -> dict[str, float]:
-    """Mean length of the reported rallies by model, played by their own trainers."""
-    own = rallies.take(rallies.own & rallies.selected)
-    return {model: float(own.length[own.model == model].mean()) for model in dict.fromkeys(own.model.tolist())}

@@ -223,13 +223,10 @@ class Pipeline:
         path = self.paths.seed(seed) / EVALUATIONS
 
         def run() -> str:
-            result = evaluation.play(
-                self.study, self._virtual[seed].reality, seed, pairings, *self._policies_and_balls(seed, models)
-            )
-            rallies = evaluation.score(seed, pairings, result, self.study.evaluation.lanes)
+            reality, played = self._virtual[seed].reality, self._policies_and_balls(seed, models)
+            rallies = evaluation.play(self.study, reality, seed, pairings, *played)
             scoring.write(path, rallies)
-            lengths = ", ".join(f"{model} {length:.1f}" for model, length in evaluation.summarise(rallies).items())
-            return f"{len(rallies):,} rallies; mean length: {lengths}"
+            return f"{len(rallies):,} rallies, {rallies.length[~rallies.filtered].mean():.1f} touches on average"
 
         balls = sorted({(trainer, self._balls_of(trainer, model)) for trainer, model in models})
         humans = tuple(self.paths.human(seed, *one) for one in balls if one[1].startswith("M"))

@@ -74,7 +74,8 @@ class Estimate:
     def __truediv__(self, other: Estimate) -> Estimate:
         with np.errstate(divide="ignore", invalid="ignore"):
             draws = np.nan_to_num(self.draws / other.draws, nan=np.inf)
-        return Estimate(_ratio(self.value, other.value), draws, self.n, max(self.value, other.value))
+        value = self.value / other.value if other.value else float("inf")
+        return Estimate(value, draws, self.n, max(self.value, other.value))
 
 
 class Bootstrap:
@@ -221,7 +222,3 @@ def t_mean(values: ArrayLike) -> Interval:
 
 def _is(own: bool | None, cell: Cell) -> bool:
     return own is None or (cell[1] == cell[2]) == own
-
-
-def _ratio(a: float, b: float) -> float:
-    return a / b if b else float("inf")

@@ -273,11 +273,8 @@ class VirtualWorld:
         with replacing(run.metrics) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in cycle.rows), encoding="utf-8")
         checkpoint.save(run.checkpoints, real_updates, cycle.state, {"seconds": 0.0})
-        tenth = max(1, real_updates // 10)
-        first, last = (
-            sum(r["return_rate"] for r in part) / tenth for part in (cycle.rows[:tenth], cycle.rows[-tenth:])
-        )
-        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {first:.0%} at first, {last:.0%} at last"
+        rates = [row["return_rate"] for row in cycle.rows]
+        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {np.mean(rates):.0%}"
         return Dataset(cycle.balls, name), text
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:

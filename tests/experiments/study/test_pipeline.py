@@ -123,7 +123,7 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
         (
             {"evaluation": {"rallies": 80, "lanes": 7}},
-            "no multiple of its lanes 7 .*the nearest that is allowed: 77 or 84",
+            "lanes 7 .*the nearest that is allowed: 77 or 84",
         ),
         ({"ablation": {"player": "player4"}}, "ablation.player 'player4' is none of the players of this study"),
         ({"identification": {"joints": "logs"}}, "identification.joints: the virtual reality records its own"),
