@@ -40,20 +40,20 @@ HUMAN_MODEL_COLOURS = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}
 
 def draw_summary(m: Measurements) -> Figure | None:
     """The claims about ratios: ours with its interval, the paper's where it states a number."""
-    shown = [f for f in m.findings.values() if f.interval is not None and f.unit == RATIO]
+    shown = [(f, f.interval) for f in m.findings.values() if f.interval is not None and f.unit == RATIO]
     if not shown:
         return None
     figure = Figure(figsize=(10.5, 0.36 * len(shown) + 1.4))
     axes = figure.subplots()
-    for row, f in enumerate(shown):
+    for row, (f, interval) in enumerate(shown):
         shade = colour(f.claim.of["a"]) if "a" in f.claim.of else INK
-        style = {"fmt": "o", "color": shade, "markersize": 6, "linewidth": 2, "capsize": 3}
-        axes.errorbar(f.interval.value, row, xerr=error_lengths(f.interval), **style)
+        lengths = error_lengths(interval)
+        axes.errorbar(interval.value, row, xerr=lengths, fmt="o", color=shade, markersize=6, linewidth=2, capsize=3)
         if f.paper is not None:
             axes.plot(f.paper, row, **DIAMOND, markersize=7, zorder=6)
         axes.annotate(f.verdict, (1.01, row), xycoords=("axes fraction", "data"), va="center", fontsize=8.5, color=INK)
     axes.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
-    axes.set_yticks(range(len(shown)), [f"{f.claim.key}: {f.claim.quantity}" for f in shown], fontsize=8)
+    axes.set_yticks(range(len(shown)), [f"{f.claim.key}: {f.claim.quantity}" for f, _ in shown], fontsize=8)
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_xscale("log")
     ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10)
@@ -97,8 +97,9 @@ def draw_rounds(m: Measurements) -> Figure | None:
             found = {i + 0.08 * (k - 0.5 * len(shown)): (i, mean.interval) for i, mean in means.items() if mean}
             shade, dashes = paper.COLOURS[method], "--" if method in (paper.FRESH, paper.S2R) else "-"
             for at, (i, mean) in found.items():
-                style = {"fmt": "o", "color": shade, "markerfacecolor": shade if i % 2 else "white", "capsize": 2.5}
-                axes.errorbar(at, mean.value, error_lengths(mean), **style)
+                face = shade if i % 2 else "white"
+                lengths = error_lengths(mean)
+                axes.errorbar(at, mean.value, lengths, fmt="o", color=shade, markerfacecolor=face, capsize=2.5)
             axes.plot(list(found), [mean.value for _, mean in found.values()], dashes, color=shade, zorder=1)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=7)
         axes.set_ylim(bottom=0)
