@@ -27,7 +27,6 @@ from rich.console import Console
 from experiments.baselines import report
 from experiments.baselines.judge import Judge
 from experiments.baselines.learners import (
-    COUNTED,
     BudgetSpent,
     Counts,
     EvolutionLearner,
@@ -208,7 +207,6 @@ class Training:
         self._pieces = -1
         self._left = (0.0, 0.0)  # readings of both clocks when learning went on
         self._share = 0.0  # of the budget that was spent
-        self._before = dict.fromkeys(COUNTED, 0.0)  # at the last point of the curve
         self._controller: Controller
         self._spent: dict[str, float] = {}
 
@@ -231,7 +229,7 @@ class Training:
         }
         share, points = min(_share(comparison.budget, self._spent), 1.0), comparison.curve.points
         if not self._curve or int(points * share) > int(points * self._share):
-            self._add_point(controller, counts)
+            self._add_point(controller)
         self._share = share
         if share >= 1.0:
             raise BudgetSpent
@@ -243,16 +241,12 @@ class Training:
         data = {"conditions": self._common.conditions(name), "curve": self._curve, "provenance": run_dir.provenance()}
         run_dir.write_json(self._folder / "training.json", data)
 
-    def _add_point(self, controller: Controller, counts: Counts) -> None:
-        since = {key: counts[key] - self._before[key] for key in COUNTED}
-        means = {key: since[key] / max(since["episodes"], 1.0) for key in ("hit", "returned", "episode_return")}
-        point = self._spent | self._judge.progress(controller) | {"training": means if since["steps"] else None}
+    def _add_point(self, controller: Controller) -> None:
+        point = self._spent | self._judge.progress(controller)
         self._curve.append(point)
-        self._before = counts
         self._common.console.print(
             f"{self._folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned "
-            f"{point['return_rate']:.1%}, touched {point['hit_rate']:.1%}, mean return "
-            f"{point['mean_return'] or float('nan'):.2f}",
+            f"{point['return_rate']:.1%}, touched {point['hit_rate']:.1%}",
             highlight=False,
             soft_wrap=True,
         )

@@ -33,7 +33,7 @@ from mjx_tt.env.policy import Policy, PolicyController
 from robot_io.contract import HISTORY
 
 ENDLESS = 2**40  # environment steps: the observer ends a training
-COUNTED = ("episodes", "steps", "hit", "returned", "episode_return")
+COUNTED = ("episodes", "steps")
 
 Counts = dict[str, float]  # COUNTED, sums over a training so far
 Decide = Callable[[Params, jax.Array], jax.Array]  # (parameters, (..., size)) -> (..., joints) in [-1, 1]
@@ -90,9 +90,7 @@ class EpisodeCounter(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         after = self.env.step(state, action)
-        sums = {name: value.sum() for name, value in after.metrics.items()}
-        sums |= {"episodes": after.done.sum(), "steps": jnp.float32(after.done.size)}
-        jax.debug.callback(self._add, jnp.stack([sums[name] for name in COUNTED]))
+        jax.debug.callback(self._add, jnp.stack([after.done.sum(), jnp.float32(after.done.size)]))
         return after
 
     def _add(self, sums: jax.Array) -> None:
@@ -112,18 +110,14 @@ class EvolutionLearner:
 
     def train(self, seed: int, observe: Observer) -> None:
         """As ``Learner``."""
-        state, counts = self.trainer.init(build.key(seed, build.INITIAL_STATE)), dict.fromkeys(COUNTED, 0.0)
-        episodes = self.trainer.episodes_per_update
-        means = {"hit": "hit_rate", "returned": "return_rate", "episode_return": "mean_return", "steps": "steps"}
+        state, episodes, steps = self.trainer.init(build.key(seed, build.INITIAL_STATE)), 0.0, 0.0
         with suppress(BudgetSpent):
             while True:
-                observe(self._controller(state), counts)
+                observe(self._controller(state), {"episodes": episodes, "steps": steps})
                 state, metrics = self.trainer.update(state)
-                metrics = {name: float(metrics[name]) for name in (*means.values(), "non_finite")}
-                finite = episodes - metrics["non_finite"]
-                counts = {name: counts[name] + finite * metrics[mean] for name, mean in means.items()} | {
-                    "episodes": counts["episodes"] + episodes
-                }
+                played = self.trainer.episodes_per_update
+                episodes += played
+                steps += (played - float(metrics["non_finite"])) * float(metrics["steps"])
 
     def template(self) -> PolicyController:
         """As ``Learner``."""
