@@ -25,7 +25,7 @@ from experiments.errors import error_context
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
-from experiments.study import evaluation, identification, training
+from experiments.study import identification, training
 from experiments.study.analysis import scoring
 from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import (
@@ -40,7 +40,7 @@ from experiments.study.schedule import (
 )
 from experiments.study.target_domain import hidden_effects, on_robot
 from experiments.study.target_domain.play_on_robot import make_blind_steps, make_rally_step
-from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld
+from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld, play_rallies
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
@@ -224,7 +224,7 @@ class Pipeline:
 
         def run() -> str:
             reality, played = self._virtual[seed].reality, self._policies_and_balls(seed, models)
-            rallies = evaluation.play(self.study, reality, seed, pairings, *played)
+            rallies = play_rallies(self.study, reality, seed, pairings, *played)
             scoring.write(path, rallies)
             return f"{len(rallies):,} rallies, {rallies.length[~rallies.filtered].mean():.1f} touches on average"
 

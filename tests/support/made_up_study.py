@@ -14,7 +14,7 @@ import numpy as np
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
 from experiments.study.analysis import scoring
-from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, IDENTIFIED, METHODS, MODELS, VARIANT
+from experiments.study.analysis.paper import ABLATION, BY_SKILL, CROSS, FINAL, FRESH, IDENTIFIED, METHODS, TEN
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, SimModel
 
@@ -71,9 +71,9 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, rallies: int = RALLIES, cross
             models.mkdir(parents=True)
             for name in ("M0", "M1", "M2"):
                 save_distribution(models / f"human_{name}.yaml", registry.load(f"{player}/{name}"))
-            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *METHODS[IDENTIFIED])]
+            wanted = [(player, key) for key in (*TEN, *METHODS[FRESH], *METHODS[IDENTIFIED])]
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
-            wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
+            wanted += [(player, key) for key in METHODS[ABLATION]] if player == ABLATION_PLAYER else []
             _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")
             for evaluator, model in wanted:
                 parts.append(_play(seed, player, evaluator, model, rallies, rng))

@@ -15,7 +15,7 @@ from ballmodel.distribution import AXES, BallDistribution, load_distribution
 from ballmodel.io.yaml import read as read_yaml
 from experiments.errors import ConfigError, error_context
 from experiments.study.analysis import scoring
-from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, IDENTIFIED, IS2R, METHODS, TEN
+from experiments.study.analysis.paper import BY_SKILL, CROSS, FINAL, IDENTIFIED, IS2R, METHOD_OF, METHODS, TEN
 from experiments.study.analysis.statistics import Models
 from experiments.study.paths import EVALUATIONS, SETTINGS, StudyPaths
 
@@ -148,9 +148,9 @@ def _settings(path: Path) -> dict[str, Any]:
 def _missing(study: StudyFolder) -> list[str]:
     """Parts that a study lacks of what its settings ask for, in words; without settings, of the paper's."""
     baselines = study.settings.get("baselines", True)
-    models = {True: TEN, False: ()}.get(baselines, tuple(m.key for m in METHODS[IS2R]))
+    models = {True: TEN, False: ()}.get(baselines, METHODS[IS2R])
     if study.settings.get("identification") is not None:
-        models += tuple(m.key for m in METHODS[IDENTIFIED])
+        models += METHODS[IDENTIFIED]
     cross = (study.settings.get("evaluation") or {}).get("cross", True)
     r = study.rallies
     evaluations = list(zip(*(a.tolist() for a in (r.seed, r.trainer, r.evaluator, r.model)), strict=True))
@@ -178,7 +178,7 @@ def _missing(study: StudyFolder) -> list[str]:
 def _known(rallies: scoring.Rallies) -> tuple[np.ndarray, list[str]]:
     """Which rallies the figures have a place for, (n,) bool, and in words those for which they have none."""
     where, out = np.ones(len(rallies), bool), []
-    for column, known in (("trainer", BY_SKILL), ("evaluator", BY_SKILL), ("model", BY_KEY)):
+    for column, known in (("trainer", BY_SKILL), ("evaluator", BY_SKILL), ("model", METHOD_OF)):
         fits = np.isin(getattr(rallies, column), list(known))
         where &= fits
         unknown = sorted(set(getattr(rallies, column)[~fits].tolist()))

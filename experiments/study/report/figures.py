@@ -29,11 +29,11 @@ DIAMOND: dict[str, Any] = {"marker": "D", "color": INK, "markerfacecolor": "whit
 MEAN = "mean rally length, 95 %"
 STAGES = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
 CURVES: dict[str, tuple[str | None, ...]] = {  # of each method at the stages
-    paper.IS2R: tuple(model.key for model in paper.METHODS[paper.IS2R]),
+    paper.IS2R: paper.METHODS[paper.IS2R],
     paper.S2R: ("is2r-sim1", "is2r-ft35", None, "s2r-ft65", None, "s2r-ft100"),
     paper.ORACLE: (None, None, None, None, "oracle-sim", "oracle-ft"),
-    paper.FRESH: ("is2r-sim1", "is2r-ft35", *(model.key for model in paper.METHODS[paper.FRESH])),
-    paper.IDENTIFIED: tuple(model.key for model in paper.METHODS[paper.IDENTIFIED]),
+    paper.FRESH: ("is2r-sim1", "is2r-ft35", *paper.METHODS[paper.FRESH]),
+    paper.IDENTIFIED: paper.METHODS[paper.IDENTIFIED],
 }
 HUMAN_MODEL_COLOURS = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}
 
@@ -87,7 +87,7 @@ def draw_rounds(m: Measurements) -> Figure | None:
     """Mean rally length after each step of the loop, over all players and by skill level (main_training_curves)."""
     players = m.study.players
     # Methods of which the study has a model that is no other method's.
-    shown = [k for k in CURVES if any(m.raw.mean(model.key, players) for model in paper.METHODS[k])]
+    shown = [k for k in CURVES if any(m.raw.mean(model, players) for model in paper.METHODS[k])]
     if not shown:
         return None
     figure = Figure(figsize=(14, 4.2))
@@ -140,9 +140,9 @@ def draw_evolution(m: Measurements) -> Figure | None:
 
 def colour(key: str) -> tuple[float, float, float]:
     """Colour of a model: its method's, paler where it is not fine-tuned."""
-    model = paper.BY_KEY[key]
-    rgb = to_rgb(paper.COLOURS[model.method])
-    pale = not model.fine_tuned and model.method != paper.ABLATION
+    method = paper.METHOD_OF[key]
+    rgb = to_rgb(paper.COLOURS[method])
+    pale = "-ft" not in key and method != paper.ABLATION
     red, green, blue = (share + 0.55 * (1.0 - share) if pale else share for share in rgb)
     return red, green, blue
 

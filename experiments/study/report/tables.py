@@ -14,7 +14,7 @@ from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
 from experiments.study.analysis.claims import HITS, Measurements, paper_changes, show, show_interval
 from experiments.study.analysis.identified import holds, list_estimates
-from experiments.study.analysis.paper import BY_KEY, CROSS, FINAL, GROUPS, SHORT, TEN, level, of_level
+from experiments.study.analysis.paper import CROSS, FINAL, GROUPS, METHOD_OF, SHORT, TEN, level, of_level
 from experiments.study.analysis.study_folder import StudyFolder
 from mjx_tt.rally.end_reasons import ROWS
 from mjx_tt.sim.model import ModelFile
@@ -135,7 +135,7 @@ def tabulate_models(m: Measurements) -> Table:
     rows = []
     for group in GROUPS:
         players = of_level(group)
-        for model in BY_KEY:
+        for model in METHOD_OF:
             mean = m.raw.mean(model, players)
             if mean is not None:
                 length, every = (m.study.pick(model, players, selected=s).length for s in (True, False))
