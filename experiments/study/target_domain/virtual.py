@@ -269,7 +269,7 @@ def play_rallies(
 
 
 def _stack(policies: Sequence[Policy], balls: Sequence[Balls], sessions: int) -> tuple[Policy, Box]:
-    """Policies and the boxes of their balls, one (..., n * sessions) array each, the sessions of a policy side by side."""
+    """Policies and the boxes of their balls, one (..., n * sessions) array each, the sessions of one side by side."""
 
     def stack(*arrays: ArrayLike) -> Array:
         return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), sessions, axis=-1)
