@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 
 import jax
 import jax.numpy as jnp
@@ -149,19 +148,6 @@ def test_every_algorithm_has_the_joints_of_the_robot(tmp_path, settings):
     assert action.shape == (7, 5) and controller.mean.shape == (10,)
 
 
-@pytest.mark.slow
-def test_a_comparison_on_another_robot_runs(tmp_path):
-    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
-    folder = compare.compare(*baselines.load(path), str(path), tmp_path, Console())
-    report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
-    assert np.isfinite(report["simulation"]["mean_return"])
-    assert compare.unfinished(compare.prepare(*baselines.load(path), str(path), tmp_path, Console())) == {"ES": []}
-    with pytest.raises(RunError, match="ES/seed0.*other settings of robot"):
-        compare.unfinished(
-            compare.prepare(*baselines.load(path, ("robot=ur10e_rail",)), str(path), tmp_path, Console())
-        )
-
-
 @pytest.mark.parametrize(
     "override, message",
     [
@@ -251,12 +237,3 @@ def test_a_site_trains_the_same(tmp_path):
     curves = [json.loads((folder / "training.json").read_text())["curve"] for folder in (alone, site)]
     timeless = [[p | {"seconds": 0, "cpu_seconds": 0} for p in curve] for curve in curves]
     assert timeless[0] == timeless[1]
-
-
-def test_trainings_at_a_time():
-    parsed = baselines.Comparison.model_validate(SMALL | {"seeds": [0, 1, 2]})
-    if jax.default_backend() == "cpu":
-        assert compare.choose(parsed, None) == min(3, len(os.sched_getaffinity(0)))
-    assert compare.choose(parsed, 2) == 2 and compare.choose(parsed, 9) == 3
-    timed = parsed.model_copy(update={"budget": baselines.Budget(minutes=1.0)})
-    assert compare.choose(timed, None) == 1

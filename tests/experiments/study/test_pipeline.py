@@ -206,16 +206,6 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
     assert schedule.count_updates(whole, by_key["oracle-sim"]) == 40000
 
 
-def test_the_loop_alone_is_compared_with_its_variants():
-    changes = ("baselines=is2r", "identification={}", "ablation=null", "evaluation={cross: false}")
-    found = schedule.list_pairings(study_config.load(study_config.shipped()["study_night"], changes))
-    of_one = {model for trainer, player, model in found if trainer == player == "player4"}
-    rounds = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
-    loops = {f"{loop}-{step}" for loop in ("is2r", "id") for step in rounds}
-    assert of_one == loops | {f"fresh-{step}" for step in ("sim2", "ft65", "sim3", "ft100")}
-    assert len(found) == 5 * len(of_one)
-
-
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
     whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
     pairs = schedule.list_pairings(whole)
