@@ -68,9 +68,8 @@ def identified(folder, served, late: float):
     logs = [served, *(folder / "hits" / file for file in ROBOT_FILES)]
     believed, before = ModelFile(SimModel()), identification.read_prior(PRIOR, "prior")
     made = identification.identify(logs, 400, believed, before, [folder / "hits"])
-    assert (
-        0.6 * hit < made.provenance["identified"]["hits"] <= hit + 1
-    )  # of balls that were hit nearly all are used, and no others
+    # Of balls that were hit nearly all are used, and no others.
+    assert 0.6 * hit < made.provenance["identified"]["hits"] <= hit + 1
     return {row["parameter"]: row for row in list_estimates(made) if row["decided by"] == LOGS}
 
 
