@@ -11,7 +11,7 @@
 # make check  set up and check style, types and imports
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make docs   set up and build the documentation into docs/_build/html; a dead link is an error
-# make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
+# make bench  set up and measure speed against MJX and MuJoCo C
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -95,7 +95,6 @@ docs: $(READY)
 	@echo "open docs/_build/html/index.html"
 
 bench: $(READY)
-	$(BIN)/pip install -q --disable-pip-version-check -e ".[bench]" || echo "PyBullet has no wheel for this Python: measured without it"
 	$(BIN)/python -m benchmarks.bench
 
 setup: $(READY)

@@ -1,4 +1,4 @@
-"""The benchmark: physics against other engines, the time of an update and where it goes, memory, growth with the batch.
+"""The benchmark: physics against other engines, the time of an update, memory, growth with the batch.
 
     python -m benchmarks.bench --out bench.json
 
@@ -8,7 +8,6 @@ never starts JAX, so it disturbs nobody and its own memory is in no figure.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import platform
@@ -18,7 +17,7 @@ from statistics import median
 from typing import Any
 
 from ballmodel.io.atomic_files import replacing
-from benchmarks.harness import Sides, Worker, WorkerError, print_table, run, summary
+from benchmarks.harness import Sides, WorkerError, print_table, run, summary
 
 
 @dataclass(frozen=True)
@@ -28,25 +27,20 @@ class Sizes:
     rounds       runs of each side
     fused, mjx   (lanes, chunks, physics steps): batches of that many robots one after the other on each device
     rollout      (robots, physics steps) of MuJoCo C
-    pybullet     physics steps of one robot per core
     pairs, repeats   of the update
     engines, turns   (pairs, repeats) of an update with each engine, and its runs
     scaling      (pairs, repeats) of updates from small to large
-    block, ticks     rows x columns of episodes and control steps of the breakdown
     """
 
     rounds: int = 7
     fused: tuple[int, int, int] = (768, 4, 200)
     mjx: tuple[int, int, int] = (256, 1, 200)
     rollout: tuple[int, int] = (512, 200)
-    pybullet: int = 20_000
     pairs: int = 200
     repeats: int = 15
     engines: tuple[int, int] = (200, 15)
     turns: int = 2
     scaling: tuple[tuple[int, int], ...] = ((2, 15), (8, 15), (20, 15), (50, 15), (200, 15), (800, 15))
-    block: tuple[int, int] = (3, 200)  # as two devices run the update
-    ticks: int = 100
 
 
 FULL = Sizes()
@@ -55,15 +49,12 @@ QUICK = Sizes(
     fused=(768, 1, 100),
     mjx=(256, 1, 40),
     rollout=(256, 100),
-    pybullet=4_000,
     engines=(20, 15),
     turns=1,
     scaling=((2, 15), (20, 15)),
-    ticks=20,
 )
-PHYSICS = ("fused", "fused_by_xla", "mjx", "mujoco_rollout", "mujoco_batch", "pybullet")
+PHYSICS = ("fused", "fused_by_xla", "mjx", "mujoco_rollout")
 MJX_LIMIT = 1800.0  # [s] for compilation and first update with MJX, and for each further one
-TRAINED = Path("runs/quickstart")  # measured too when it is there
 
 
 def main(*, out: Path | None = None, quick: bool = False) -> None:
@@ -92,14 +83,6 @@ def measure(sizes: Sizes) -> dict[str, Any]:
     pairs, repeats = sizes.engines
     print(f"one update of {2 * pairs * repeats:,} episodes with each engine (MJX takes minutes) ...")
     report["engines"] = measure_engines(pairs, repeats, sizes.turns)
-    print("parts of a control step ...")
-    rows, columns = sizes.block
-    with Worker("breakdown", {cores[0]}, rows=rows, columns=columns, ticks=sizes.ticks) as worker:
-        worker.wait_ready()
-        worker.start()
-        found: Any = worker.finish()
-    report["breakdown"] = found.pop("parts")
-    report["roofline"] = found
     print("updates by number of episodes ...")
     report["batch_scaling"] = [measure_batch(*size, min(sizes.rounds, 5)) for size in sizes.scaling]
     return report
@@ -116,10 +99,6 @@ def measure_physics(sizes: Sizes, cores: int) -> dict[str, Any]:
             sides.add(name, name, lanes=lanes, chunks=chunks, steps=steps)
         robots, steps = sizes.rollout
         sides.add("mujoco_rollout", "mujoco_rollout", robots=robots, steps=steps, threads=cores)
-        if importlib.util.find_spec("mujoco.batch"):  # since MuJoCo 3.17
-            sides.add("mujoco_batch", "mujoco_batch", robots=robots, steps=steps, threads=cores)
-        if importlib.util.find_spec("pybullet"):
-            sides.add("pybullet", "pybullet", [None] * cores, steps=sizes.pybullet, seed=0)
         measured = sides.measure(sizes.rounds)
     speed = {name: median(amount / seconds for seconds, amount in runs) for name, runs in measured.items()}
     return {
@@ -141,7 +120,7 @@ def seconds_of(runs: list[tuple[float, float]]) -> dict[str, float]:
 
 
 def measure_update(sizes: Sizes, cores: list[int]) -> dict[str, Any]:
-    """Seconds per update at the start of training and under a trained policy, by number of devices; peak memory."""
+    """Seconds per update at the start of training, by number of devices; peak memory."""
     n, size = len(cores), scale(sizes.pairs, sizes.repeats)
     with Sides() as sides:
         sides.add("all_devices", "update", changes=size, devices=n)
@@ -150,8 +129,6 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict[str, Any]:
         sides.add("common_random_numbers", "update", changes=[*size, common], devices=n)
         sides.add("one_device_all_cores", "update", changes=size, devices=1)
         sides.add("one_device_one_core", "update", [{cores[0]}], changes=size, devices=1)
-        if TRAINED.is_dir():
-            sides.add("trained_policy", "update", changes=[*size, f"initial_policy={TRAINED}"], devices=n)
         seconds = {name: seconds_of(runs) for name, runs in sides.measure(sizes.rounds).items()}
     devices = {name: seconds[name]["median"] for name in ("one_device_one_core", "one_device_all_cores", "all_devices")}
     return {
@@ -160,7 +137,6 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict[str, Any]:
         "update_by_xla_s": seconds["by_xla"],
         "lanes_speedup": seconds["by_xla"]["median"] / seconds["all_devices"]["median"],
         "update_common_random_numbers_s": seconds["common_random_numbers"],
-        "update_trained_policy_s": seconds.get("trained_policy"),
         "devices_s": devices,
         "devices_speedup": devices["one_device_one_core"] / devices["all_devices"],
         "peak_memory_mb": sides.peak_memory("all_devices"),
@@ -224,9 +200,8 @@ def show(report: dict[str, Any]) -> None:
         "start of training": "update_s",
         "control steps by XLA": "update_by_xla_s",
         "common random numbers": "update_common_random_numbers_s",
-        "trained policy": "update_trained_policy_s",
     }
-    rows = [(name, *_spread(report[key])) for name, key in updates.items() if report[key]]
+    rows = [(name, *_spread(report[key])) for name, key in updates.items()]
     rows += [(name.replace("_", " "), f"{seconds:.3f}") for name, seconds in report["devices_s"].items()]
     print_table(f"One update, {report['update_episodes']:,} episodes", ("", "median [s]", "min", "max"), rows)
     print(f"lane by lane against by XLA: {report['lanes_speedup']:.2f} x")
@@ -238,11 +213,6 @@ def show(report: dict[str, Any]) -> None:
         rows = [(name, *_spread(found), f"{memory[name]:,.0f}") for name, found in engines["update_s"].items()]
         title = f"One update of {engines['episodes']:,} episodes by engine"
         print_table(title, ("engine", "median [s]", "min", "max", "peak memory [MB]"), rows)
-
-    parts = report["breakdown"]
-    rows = [(row["part"], row["calls"], f"{row['ns']:.0f}", f"{row['share']:.0%}") for row in parts]
-    print_table("Parts of a control step, one core", ("part", "calls", "ns per episode", "share"), rows)
-    show_roofline(parts, report["roofline"])
 
     columns = {
         "episodes": ",",
@@ -257,27 +227,6 @@ def show(report: dict[str, Any]) -> None:
 
 def _spread(seconds: dict[str, float]) -> list[str]:
     return [f"{seconds[key]:.3f}" for key in ("median", "min", "max")]
-
-
-def show_roofline(parts: list[dict[str, Any]], roofline: dict[str, Any]) -> None:
-    """Operations and bytes of each part per episode and control step, and the share of one core's peaks reached."""
-    peaks = {name: value / 1e9 for name, value in roofline["peaks"].items()}
-    rows = []
-    for row in parts:
-        if "operations" in row:
-            rate, intensity = row["operations"] / row["ns"], row["operations"] / row["bytes"]
-            roof = min(peaks["fma_peak"], intensity * peaks["cache_bandwidth"])
-            cells = (f"{row['kernels']:,.0f}", f"{row['operations']:,.0f}", f"{row['bytes'] / 1e3:.1f}")
-            shares = (f"{rate / peaks['fma_peak']:.0%}", f"{rate / roof:.0%}")
-            rows.append((row["part"], *cells, f"{intensity:.2f}", f"{rate:.1f}", *shares))
-    title = "Roofline: an episode's control step, one core; shares of the peak and of the roof"
-    print_table(title, ("part", "kernels", "op", "kB", "op/B", "Gop/s", "peak", "roof"), rows)
-    print(
-        f"peaks: {peaks['fma_peak']:.1f} Gop/s in multiply-adds of float32 (XLA {peaks['fma_xla']:.1f}, NumPy's matrix "
-        f"product {peaks['fma_blas']:.1f}); {peaks['cache_bandwidth']:.1f} GB/s at the "
-        f"{roofline['working_set_mb']:.1f} MB that a block of episodes uses, {peaks['memory_bandwidth']:.1f} GB/s in "
-        "memory"
-    )
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ from rich.console import Console
 from ballmodel.distribution import save_distribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
-from ballmodel.partial_params import without_nominal
 from benchmarks.harness import each_missing, read_all, run
 from experiments import measurements
 from experiments.config import build, experiment
@@ -34,7 +33,7 @@ from experiments.stats import wilson
 from experiments.study import identification
 from experiments.study.analysis.identified import LOGS, holds, list_estimates
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.virtual import VirtualReality, add_spin
+from experiments.study.target_domain.virtual import VirtualReality
 from experiments.training.loop import train
 from mjx_tt import platform
 from mjx_tt.env.episode import RETURNED
@@ -46,7 +45,8 @@ QUICKSTART = Path("experiments/shipped/policies/quickstart")
 World = Literal["nominal", "prior", "identified", "hits", "truth"]
 WORLDS: tuple[World, ...] = ("nominal", "prior", "identified", "hits", "truth")
 CLASSES = ((), ("lift",), (), ("bounce",), (), ("blade",), (), ("mount",), (), ("lift", "bounce", "blade", "mount"))
-BALLS, RALLIES, LANES = 4000, 80, 16  # balls of each evaluation; rallies of each policy, in lanes
+BALLS = 4000  # of each evaluation
+STROKES = 512  # from which the spin of a player's strokes is known
 CAMERA_NOISE = 0.003  # [m]
 BELIEVED = SimModel().latency.ball_observation  # [s]
 SHARED = {"lift": ("flight",), "bounce": ("restitution",), "blade": ("paddle.restitution",), "mount": ()}
@@ -62,7 +62,6 @@ def main(
     balls: int = 300,
     seconds: float = 60.0,
     worlds: tuple[World, ...] = WORLDS,
-    untrained: bool = False,
     show: bool = False,
 ) -> int:
     """Measures, prints and writes; returns the exit status.
@@ -73,7 +72,6 @@ def main(
         balls: across the table, before the first play
         seconds: of the joints' motion
         worlds: to train in
-        untrained: intervals alone: nothing is trained or played
         show: only print what is finished
     """
     platform.configure(devices=1)
@@ -82,7 +80,7 @@ def main(
         given = (
             path,
             seed,
-            0 if untrained else updates,
+            updates,
             player,
             (balls, seconds),
             tuple(w for w in WORLDS if w in worlds),
@@ -96,12 +94,6 @@ def main(
     if not found:
         print(f"{out}: no reality is finished")
         return 1
-    if untrained:
-        for title, outside in (("in class", False), ("outside", True)):
-            some = [one for one in found if bool(one["outside"]) == outside]
-            if some:
-                print("\n".join([f"{title}, {len(some)} realities", *coverage(some, ("identified", "hits"))]))
-        return 0
     text = summary(found)
     (out / "summary.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
@@ -118,7 +110,7 @@ def _one(
 def of_reality(
     out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], trained_in: tuple[World, ...]
 ) -> dict[str, Any]:
-    """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
+    """Logs, identification, trainings and evaluations of one reality."""
     outside = CLASSES[seed % len(CLASSES)]
     rounds = [{"simulated": 1, "real": 1}] * 3
     study = studies.parse(
@@ -140,10 +132,10 @@ def of_reality(
     counts = {}
     for name, hits in (("identified", ()), ("hits", (folder / "hits",))):
         began = time.monotonic()
-        found = identification.identify(logs, 400, ModelFile(SimModel()), prior, hits)
-        seconds[name], worlds[name] = time.monotonic() - began, found.world
-        counts[name] = found.hits
-        found.world.save(folder / f"{name}.yaml")
+        world = identification.identify(logs, 400, ModelFile(SimModel()), prior, hits)
+        seconds[name], worlds[name] = time.monotonic() - began, world
+        counts[name] = (world.provenance or {})["identified"]["hits"]
+        world.save(folder / f"{name}.yaml")
     worlds["truth"] = ModelFile(add_spin(reality, player, keys[6]))
     base = {
         "seed": seed,
@@ -153,8 +145,6 @@ def of_reality(
         "identification_seconds": seconds,
         "intervals": {name: intervals(worlds[name], reality.model) for name in ("identified", "hits")},
     }
-    if not updates:
-        return base
     human, _ = fit_human(measurements.read_trajectories([folder / "D0.csv"]), ball_params(), short_balls=True)
     save_distribution(folder / "M0.yaml", human)
     policies: dict[str, Policy] = {
@@ -162,16 +152,20 @@ def of_reality(
     }
     policies["quickstart"] = policy
     played = {name: returned(reality, person, reality.known, p, keys[3]) for name, p in policies.items()}
-    believed = without_nominal(models.draw(keys[4], worlds["hits"].model, worlds["hits"].randomise, (BALLS,)))
-    predicted = {name: returned(reality, person, believed, p, keys[3]) for name, p in policies.items()}
-    nominal = {name: returned(reality, person, without_nominal(SimModel()), p, keys[3]) for name, p in policies.items()}
     return base | {
         "returned": {name: _rate(x) for name, x in played.items()},
-        "below_truth": {name: _paired(played["truth"], x) for name, x in played.items() if "truth" in played},
-        "predicted": {name: float(x.mean()) for name, x in predicted.items()},
-        "predicted_nominal": {name: float(x.mean()) for name, x in nominal.items()},
-        "rally": rallies(reality, person, policies, keys[5]),
     }
+
+
+def add_spin(reality: VirtualReality, player: str, key: jax.Array) -> SimModel:
+    """The reality's model with mean and spread of the spin of a player's strokes."""
+    state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
+    spin = np.asarray(state.ball.spin)
+    mean, std = (
+        {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
+        for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
+    )
+    return models.with_values(reality.model, mean | std)
 
 
 def trained(folder: Path, world: ModelFile, updates: int, human: Path) -> Policy:
@@ -202,17 +196,6 @@ def returned(reality: VirtualReality, person: Any, model: SimModel, policy: Poli
     return np.asarray((shots.outcome == RETURNED) & shots.finite)
 
 
-def rallies(reality: VirtualReality, person: Any, policies: dict[str, Policy], key: jax.Array) -> dict[str, Any]:
-    """Length of RALLIES rallies of each policy: mean, and its standard error over the sessions."""
-    wide = jax.tree.map(
-        lambda *x: jnp.repeat(jnp.stack([jnp.asarray(a, jnp.float32) for a in x], -1), LANES, -1), *policies.values()
-    )
-    result = reality.simulator.play(wide, person, reality.known, key, RALLIES // LANES)
-    length = np.asarray(result.length).reshape(-1, len(policies), LANES).mean(axis=0)
-    error = length.std(axis=1, ddof=1) / LANES**0.5
-    return {name: {"mean": float(length[i].mean()), "error": float(error[i])} for i, name in enumerate(policies)}
-
-
 def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
     """Truth, low and high end of the 90 % interval of every parameter that the logs decided.
 
@@ -224,22 +207,17 @@ def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """The bars of the issue in words and numbers."""
+    """Returned shares by reality and world, and by class the medians and the coverage of the intervals."""
     worlds: list[str] = [w for w in WORLDS if all(w in one["returned"] for one in found)]
-    lines = ["seed class " + " ".join(f"{w:>16s}" for w in worlds) + "   rally of the same"]
+    lines = ["seed class " + " ".join(f"{w:>16s}" for w in worlds)]
     for one in found:
         rates = [one["returned"][world] for world in worlds]
         cells = " ".join(f"{100 * r['rate']:5.1f} ({100 * r['low']:4.1f}-{100 * r['high']:4.1f})" for r in rates)
-        rally = " ".join(f"{one['rally'][w]['mean']:4.1f}" for w in worlds)
-        lines.append(f"{one['seed']:4d} {'+'.join(one['outside']) or 'in':24s} {cells}   {rally}")
+        lines.append(f"{one['seed']:4d} {'+'.join(one['outside']) or 'in':24s} {cells}")
     for title, outside in (("in class", False), ("outside", True)):
         some = [one for one in found if bool(one["outside"]) == outside]
         if some:
             lines += _of_class(title, some, worlds)
-    for name, key in (("identified with hits", "predicted"), ("nominal", "predicted_nominal")):
-        errors = np.array([100 * abs(f[key][w] - f["returned"][w]["rate"]) for f in found for w in f["returned"]])
-        close, middle = int((errors <= 5).sum()), float(np.median(errors))
-        lines.append(f"predicted by {name}: {close} of {errors.size} policies within 5 points, median {middle:.1f}")
     seconds = ", ".join(f"{f['identification_seconds']['identified']:.0f}" for f in found)
     with_hits = ", ".join(f"{f['identification_seconds']['hits']:.0f}" for f in found)
     lines.append(f"seconds of identification: {seconds}; with hits, compiled or not: {with_hits}")
@@ -283,12 +261,6 @@ def coverage(some: list[dict[str, Any]], worlds: tuple[str, ...]) -> list[str]:
 def _rate(x: np.ndarray) -> dict[str, float]:
     low, high = wilson(int(x.sum()), x.size)
     return {"rate": float(x.mean()), "low": low, "high": high}
-
-
-def _paired(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    """Mean of a - b ball by ball, with its standard error."""
-    d = a.astype(float) - b.astype(float)
-    return {"points": float(100 * d.mean()), "error": float(100 * d.std(ddof=1) / d.size**0.5)}
 
 
 def _made(folder: Path) -> Path:

@@ -1,8 +1,7 @@
 """Rallies through the bridge beside the simulator's: ``python -m benchmarks.robot_rallies POLICY [--player player3]``.
 
 The same policy and virtual player, in the rig in lock-step and in the simulator's rally code: lengths with 95 %
-intervals and how rallies ended; the bridge's counts are compared with what the world saw, and the trackers' numbers
-(per ball, per stroke, lost at the human's side) with each other.
+intervals and how rallies ended; the bridge's counts are compared with what the world saw.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from experiments.config.build import Experiment
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.runs import load_policy
-from experiments.stats import wilson
 from mjx_tt import platform
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
@@ -31,12 +29,10 @@ from mjx_tt.robot.robots import paper
 from robot_io.control import rally
 from robot_io.control.config import RobotConfig
 from robot_io.control.interfaces import BridgeConfig
-from robot_io.control.rally import RallySummary
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.opponent import Rallies
 from robot_io.emulator.tracker import TrackerParams
-from robot_io.emulator.world import World
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.rally_ends import FILTERED, End
 
@@ -50,8 +46,7 @@ def main(
     player: str = "player3",
     rallies: int = 100,
     simulated: int = 2000,
-    trackers: tuple[Literal["ball", "stroke", "lost"], ...] = ("ball",),
-    pairs: int = 60,
+    tracker: Literal["ball", "stroke", "lost"] = "ball",
     noise: float = 0.003,
     seed: int = 1,
 ) -> None:
@@ -59,10 +54,9 @@ def main(
 
     Args:
         policy: run or artefact
-        rallies: in the rig, for each tracker
+        rallies: in the rig
         simulated: in the simulator
-        trackers: the first with each other
-        pairs: rallies by which two trackers are compared
+        tracker: its numbers are per ball, per stroke, or it loses the ball at the human's side
         noise: [m] of the tracker
     """
     platform.configure(devices=1)
@@ -70,11 +64,9 @@ def main(
     box = Box.of(experiment.distribution)
     if simulated:
         play_simulated(loaded, player, experiment, box, simulated, seed)
-    tracker = TrackerParams(identity=trackers[0], noise=noise)
     if rallies:
-        play_rig(loaded, player, RigParams(tracker=tracker, seed=seed), box, rallies, seed)
-    for identity in trackers[1:]:
-        compare(loaded, player, tracker, identity, box, pairs)
+        params = RigParams(tracker=TrackerParams(identity=tracker, noise=noise), seed=seed)
+        play_rig(loaded, player, params, box, rallies, seed)
 
 
 def play_simulated(policy: Policy, player: str, experiment: Experiment, box: Box, rallies: int, seed: int) -> None:
@@ -89,48 +81,6 @@ def play_simulated(policy: Policy, player: str, experiment: Experiment, box: Box
     length, end = np.asarray(result.length).ravel(), np.asarray(result.end).ravel()
     counts = ~np.isin(end, [int(e) for e in FILTERED])
     show("simulator", length[counts], Counter(End(e).name for e in end[counts]), float(np.sum(result.seconds)))
-
-
-class Serial(VirtualPlayer):
-    """A player whose chance in each session follows from ``session`` alone."""
-
-    session = 0
-
-    def prepare(self) -> None:
-        super().prepare()
-        self._turn = 1000 * self.session
-
-
-def compare(policy: Policy, player: str, tracker: TrackerParams, identity: str, box: Box, pairs: int) -> None:
-    """The first rally of each of so many sessions with either tracker, all else alike, noise included while it can."""
-    world, person, config = World(SCENE, RigParams().world), Serial(player), bridge_config(box)
-    found: list[list[RallySummary]] = []
-    for person.session in range(pairs):
-        pair = []
-        for chosen in (tracker, replace(tracker, identity=identity)):
-            params = RigParams(tracker=chosen, seed=person.session)
-            robot = LockStep(SCENE, person, StreamingPolicy(policy), params, config, world=world)
-            pair += first_rally(robot)
-        if len(pair) == 2:
-            found.append(pair)
-    same = sum((a.length, a.end) == (b.length, b.end) for a, b in found)
-    differences = np.array([b.length - a.length for a, b in found], float)
-    mean, low, high = mean_interval(differences)
-    share = wilson(same, len(found))
-    print(
-        f"{identity} and {tracker.identity}, noise {1e3 * tracker.noise:g} mm: {same} of {len(found)} rallies of equal "
-        f"length and end ({share[0]:.0%} to {share[1]:.0%}); lengths differ by {mean:+.2f} "
-        f"({low:+.2f} to {high:+.2f}) touches; mean {np.mean([a.length for a, _ in found]):.2f}, longest "
-        f"{max(a.length for a, _ in found)}"
-    )
-
-
-def first_rally(robot: LockStep) -> list[RallySummary]:
-    """The first rally from power-on; none where a fault came before its end."""
-    robot.start()
-    robot.throwing = True
-    robot.run(LONGEST_RALLY, lambda: bool(robot.rallies) or bool(robot.bridge.gate.faults))
-    return robot.rallies[:1]
 
 
 def bridge_config(box: Box) -> BridgeConfig:

@@ -1,6 +1,6 @@
 """Sides of the comparisons. Each function prepares one and returns (what it says about itself, its work).
 
-The work is a function without arguments that returns how much it did: physics steps, episodes or lines of a table.
+The work is a function without arguments that returns how much it did: physics steps or episodes.
 
 All robot-only sides do the same: the robot of the MJCF from its home pose, 300 physics steps per second, new random
 velocity commands 75 times per second.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # a side without JAX does not load it
 
     State: TypeAlias = tuple[Array, Array]  # qpos, qvel
 
-Side = tuple[dict, Callable[[], float | dict]]
+Side = tuple[dict, Callable[[], float]]
 
 SIM_RATE = 300.0
 SUBSTEPS = 4  # physics steps per command
@@ -116,45 +116,6 @@ def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
     return {"version": mujoco.__version__}, work
 
 
-def mujoco_batch(robots: int, steps: int, threads: int) -> Side:
-    """MuJoCo C's batch API in float64: its own threads, a command written 75 times per second."""
-    import mujoco
-    from mujoco import batch
-
-    from mjx_tt.robot import mjcf
-
-    model = mjcf.load_model()
-    model.opt.timestep = 1.0 / SIM_RATE
-    simulations = batch.Batch(model, nsim=robots, nthread=threads)
-    control = simulations.bind("ctrl")
-    controls = commands((steps // SUBSTEPS, robots, 8), axis=2).astype(float)
-
-    def work() -> float:
-        simulations.reset(keyframe=0)
-        for command in controls:
-            control[:] = command
-            simulations.step(nstep=SUBSTEPS)
-        return robots * steps
-
-    return {"version": mujoco.__version__}, work
-
-
-def pybullet(steps: int, seed: int) -> Side:
-    """PyBullet in one process: one robot with velocity motors on its eight joints."""
-    from benchmarks.pybullet_robot import PyBulletRobot
-
-    robot = PyBulletRobot(1.0 / SIM_RATE)
-    controls = commands((steps // SUBSTEPS, 8), axis=1, seed=seed).astype(float)
-
-    def work() -> float:
-        robot.reset()
-        for control in controls:
-            robot.run(control, SUBSTEPS)
-        return steps
-
-    return {"version": robot.version}, work
-
-
 def update(changes: list[str], devices: int | None = None, name: str = "paper") -> Side:
     """One training update of a shipped experiment, the paper's settings if none is named, with some keys changed."""
     from mjx_tt import platform
@@ -228,16 +189,6 @@ def _trainer(changes: list[str], name: str = "paper") -> tuple[Trainer, TrainSta
     return trainer, trainer.init(jax.random.key(0))
 
 
-def breakdown(rows: int, columns: int, ticks: int) -> Side:
-    """The parts of a control step one by one; the work returns times, counts and peaks instead of an amount."""
-    from mjx_tt import platform
-
-    platform.configure(1)
-    from benchmarks.breakdown import time_parts
-
-    return about_jax(), time_parts(rows, columns, ticks)
-
-
 def about_jax() -> dict:
     import jax
 
@@ -245,9 +196,9 @@ def about_jax() -> dict:
     return {"device": f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})", "version": jax.__version__}
 
 
-def commands(shape: tuple[int, ...], axis: int, seed: int = 0) -> np.ndarray:
+def commands(shape: tuple[int, ...], axis: int) -> np.ndarray:
     """Random joint velocities [m/s], [rad/s], float32, of this shape; ``axis`` counts the joints."""
     from robot_io.contract import LIMITS
 
     largest = COMMAND * np.asarray(LIMITS.velocity, np.float32).reshape((-1,) + (1,) * (len(shape) - axis - 1))
-    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32) * largest
+    return np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32) * largest

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -44,39 +44,6 @@ def welch_interval(a: ArrayLike, b: ArrayLike) -> tuple[float, float, float]:
     with _nearly_equal_values():
         interval = stats.ttest_ind(b, a, equal_var=False).confidence_interval()
     return difference, float(interval.low), float(interval.high)
-
-
-def welch_p(a: ArrayLike, b: ArrayLike) -> float:
-    """Two-sided p of equal means by Welch's t; of samples without spread 0, or 1 where they are the same."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    if not a.std() and not b.std():
-        return float(a.mean() == b.mean())
-    with _nearly_equal_values():
-        return float(stats.ttest_ind(a, b, equal_var=False).pvalue)
-
-
-def sign_flip(differences: ArrayLike, key: int = 0) -> float:
-    """Two-sided p of a mean of zero, from the signs of the differences alone being exchangeable (Fisher's test).
-
-    Exact up to 15 differences. With n of them it cannot be smaller than 2 / 2^n.
-    """
-    d = np.asarray(differences, float)
-    if d.size < 2:
-        return 1.0
-    found = stats.permutation_test(
-        (d,), np.sum, permutation_type="samples", vectorized=True, n_resamples=2**15, rng=np.random.default_rng(key)
-    )
-    return float(found.pvalue)
-
-
-def holm(p: Iterable[float]) -> list[float]:
-    """p-values adjusted for their number: one family in twenty has a false one below 0.05 (Holm 1979)."""
-    p = np.asarray(list(p), float)
-    order = np.argsort(p)
-    adjusted = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
-    out = np.empty(p.size)
-    out[order] = np.minimum(adjusted, 1.0)
-    return out.tolist()
 
 
 @contextmanager

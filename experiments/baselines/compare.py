@@ -6,7 +6,7 @@ Folder of a comparison:
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
-  comparison.json, curves.csv, *.png, comparison.html   the report (``report``)
+  comparison.json, *.png, comparison.html   the report (``report``)
 
 An algorithm with a seed is trained in one go: interrupted, that one begins again, and those that are finished stay.
 """
@@ -27,17 +27,14 @@ from rich.console import Console
 from experiments.baselines import report
 from experiments.baselines.judge import Judge
 from experiments.baselines.learners import (
-    COUNTED,
     BudgetSpent,
     Counts,
     EvolutionLearner,
     Learner,
     PpoLearner,
-    SacLearner,
 )
-from experiments.baselines.qt_opt import QtOptLearner
 from experiments.config import build
-from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Ppo, QtOpt
+from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, error_context
@@ -52,7 +49,6 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
-BRAX = "brax's training functions"  # trainings by loops that came before them are other ones
 
 
 @dataclass(frozen=True)
@@ -70,21 +66,13 @@ class Common:
         return self.folder / name / f"seed{seed}"
 
     def conditions(self, name: str) -> dict[str, Any]:
-        """Settings that decide a training, as plain data."""
+        """Settings that decide a training and its evaluation, as plain data."""
         config = self.trains_in[name].config.to_dict()
         shared = {key: config[key] for key in ("robot", *OWN, "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
-        if algorithm["kind"] != "bgs":
-            shared["learner"] = BRAX
-        return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
-
-    def evaluation_conditions(self) -> dict[str, Any]:
-        """Settings that decide an evaluation besides the policy."""
-        return {
-            "evaluation": self.experiment.config.evaluation.model_dump(mode="json"),
-            "reality": self.comparison.reality,
-        }
+        judged = {"evaluation": self.experiment.config.evaluation.model_dump(mode="json"), "reality": given["reality"]}
+        return shared | judged | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
 
 def choose(comparison: Comparison, processes: int | None) -> int:
@@ -177,10 +165,7 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner:
         return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
     simulator = Simulator(experiment.task, 1)
-    env = TableTennis(simulator, pool, model.model, model.randomise)
-    if isinstance(settings, QtOpt):
-        return QtOptLearner(settings, env)
-    return PpoLearner(settings, env) if isinstance(settings, Ppo) else SacLearner(settings, env)
+    return PpoLearner(settings, TableTennis(simulator, pool, model.model, model.randomise))
 
 
 class Trainings:
@@ -204,7 +189,7 @@ class Trainings:
         if restored is None:
             raise RunError(f"{folder / 'policy'}: holds no policy, though training.json is there; remove {folder}")
         found = self._judge.final(restored[0])
-        run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
+        run_dir.write_json(folder / "evaluation.json", found)
         rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
         return f"returned in {', in '.join(rates)}"
 
@@ -222,7 +207,6 @@ class Training:
         self._pieces = -1
         self._left = (0.0, 0.0)  # readings of both clocks when learning went on
         self._share = 0.0  # of the budget that was spent
-        self._before = dict.fromkeys(COUNTED, 0.0)  # at the last point of the curve
         self._controller: Controller
         self._spent: dict[str, float] = {}
 
@@ -245,7 +229,7 @@ class Training:
         }
         share, points = min(_share(comparison.budget, self._spent), 1.0), comparison.curve.points
         if not self._curve or int(points * share) > int(points * self._share):
-            self._add_point(controller, counts)
+            self._add_point(controller)
         self._share = share
         if share >= 1.0:
             raise BudgetSpent
@@ -257,16 +241,12 @@ class Training:
         data = {"conditions": self._common.conditions(name), "curve": self._curve, "provenance": run_dir.provenance()}
         run_dir.write_json(self._folder / "training.json", data)
 
-    def _add_point(self, controller: Controller, counts: Counts) -> None:
-        since = {key: counts[key] - self._before[key] for key in COUNTED}
-        means = {key: since[key] / max(since["episodes"], 1.0) for key in ("hit", "returned", "episode_return")}
-        point = self._spent | self._judge.progress(controller) | {"training": means if since["steps"] else None}
+    def _add_point(self, controller: Controller) -> None:
+        point = self._spent | self._judge.progress(controller)
         self._curve.append(point)
-        self._before = counts
         self._common.console.print(
             f"{self._folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned "
-            f"{point['return_rate']:.1%}, touched {point['hit_rate']:.1%}, mean return "
-            f"{point['mean_return'] or float('nan'):.2f}",
+            f"{point['return_rate']:.1%}, touched {point['hit_rate']:.1%}",
             highlight=False,
             soft_wrap=True,
         )
@@ -288,8 +268,7 @@ def _finished(common: Common, name: str, seed: int) -> bool:
         raise RunError(
             f"{folder}: was trained with other settings of {', '.join(differing)}; choose another name or another --out"
         )
-    path = folder / "evaluation.json"
-    return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
+    return (folder / "evaluation.json").exists()
 
 
 def _share(budget: Budget, spent: dict[str, float]) -> float:

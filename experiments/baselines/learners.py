@@ -1,19 +1,16 @@
-"""Algorithms of a comparison on one task: evolution strategies of ``bgs``, and brax's own PPO and SAC training.
+"""Algorithms of a comparison on one task: evolution strategies of ``bgs``, and brax's own PPO training.
 
 A learner trains until its observer says that the budget is spent. The observer sees the policy and what the episodes
-brought after every piece of learning. A run cannot be resumed inside: brax's training functions restore networks, but
-neither the optimiser nor the replay buffer.
+brought after every piece of learning. A run cannot be resumed inside: brax's training function restores networks, but
+not the optimiser.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -24,23 +21,19 @@ from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import NestedMeanStd
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
-from brax.training.agents.sac import checkpoint as sac_checkpoint
-from brax.training.agents.sac import networks as sac_networks
-from brax.training.agents.sac import train as sac
 from brax.training.types import Params
 
 from bgs import normalizer
 from experiments.config import build
-from experiments.config.baselines import Ppo, Sac
+from experiments.config.baselines import Ppo
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import flatten
 from mjx_tt.env.episode import Controller, Tick
 from mjx_tt.env.policy import Policy, PolicyController
 from robot_io.contract import HISTORY
 
-PIECE = 512  # control steps of each environment between two looks at a learner with a replay buffer
 ENDLESS = 2**40  # environment steps: the observer ends a training
-COUNTED = ("episodes", "steps", "hit", "returned", "episode_return")
+COUNTED = ("episodes", "steps")
 
 Counts = dict[str, float]  # COUNTED, sums over a training so far
 Decide = Callable[[Params, jax.Array], jax.Array]  # (parameters, (..., size)) -> (..., joints) in [-1, 1]
@@ -72,14 +65,6 @@ class NetworkController:
     mean: jax.Array  # (observed,) of the newest observation in the normaliser
     decide: Decide = field(metadata={"static": True})
 
-    @classmethod
-    def of(cls, normaliser: NestedMeanStd, parameters: Params, decide: Decide) -> NetworkController:
-        """``normaliser``: brax's running statistics of the histories."""
-        scale = NestedMeanStd(jnp.array(normaliser.mean), jnp.array(normaliser.std))
-        newest = scale.mean.shape[0] // HISTORY
-        # Copies, as brax gives the memory of a state to the next one.
-        return cls((scale, jax.tree.map(jnp.array, parameters)), scale.mean[-newest:], decide)
-
     def start(self, observation: jax.Array) -> jax.Array:
         return jnp.broadcast_to(observation, (HISTORY, *observation.shape))
 
@@ -105,9 +90,7 @@ class EpisodeCounter(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         after = self.env.step(state, action)
-        sums = {name: value.sum() for name, value in after.metrics.items()}
-        sums |= {"episodes": after.done.sum(), "steps": jnp.float32(after.done.size)}
-        jax.debug.callback(self._add, jnp.stack([sums[name] for name in COUNTED]))
+        jax.debug.callback(self._add, jnp.stack([after.done.sum(), jnp.float32(after.done.size)]))
         return after
 
     def _add(self, sums: jax.Array) -> None:
@@ -127,18 +110,14 @@ class EvolutionLearner:
 
     def train(self, seed: int, observe: Observer) -> None:
         """As ``Learner``."""
-        state, counts = self.trainer.init(build.key(seed, build.INITIAL_STATE)), dict.fromkeys(COUNTED, 0.0)
-        episodes = self.trainer.episodes_per_update
-        means = {"hit": "hit_rate", "returned": "return_rate", "episode_return": "mean_return", "steps": "steps"}
+        state, episodes, steps = self.trainer.init(build.key(seed, build.INITIAL_STATE)), 0.0, 0.0
         with suppress(BudgetSpent):
             while True:
-                observe(self._controller(state), counts)
+                observe(self._controller(state), {"episodes": episodes, "steps": steps})
                 state, metrics = self.trainer.update(state)
-                metrics = {name: float(metrics[name]) for name in (*means.values(), "non_finite")}
-                finite = episodes - metrics["non_finite"]
-                counts = {name: counts[name] + finite * metrics[mean] for name, mean in means.items()} | {
-                    "episodes": counts["episodes"] + episodes
-                }
+                played = self.trainer.episodes_per_update
+                episodes += played
+                steps += (played - float(metrics["non_finite"])) * float(metrics["steps"])
 
     def template(self) -> PolicyController:
         """As ``Learner``."""
@@ -148,53 +127,19 @@ class EvolutionLearner:
         return PolicyController.of(Policy(state.bgs.average, *normalizer.normaliser(state.statistics)))
 
 
-class BraxLearner:
-    """What PPO and SAC share: networks, their deterministic policy, and the settings that brax names alike."""
-
-    def __init__(self, settings: Ppo | Sac, env: Env, factory: Any, make_inference_fn: Any) -> None:
-        self.env, self.factory = env, factory
-        self._networks = factory(
-            env.observation_size, env.action_size, preprocess_observations_fn=running_statistics.normalize
-        )
-        self._make_policy = make_inference_fn(self._networks)
-        self.shared = {
-            "num_timesteps": ENDLESS,
-            "max_devices_per_host": 1,
-            "episode_length": 1,  # of evaluations and wrappers that are not used
-            "normalize_observations": True,
-            "learning_rate": settings.learning_rate,
-            "discounting": settings.discount,
-            "reward_scaling": settings.reward_scale,
-            "network_factory": factory,
-        }
-
-    def template(self) -> NetworkController:
-        """As ``Learner``."""
-        return jax.eval_shape(
-            lambda: self.controller(
-                empty_normaliser(self.env.observation_size), self._networks.policy_network.init(jax.random.PRNGKey(0))
-            )
-        )
-
-    def controller(self, normaliser: NestedMeanStd, policy: Params) -> NetworkController:
-        """The policy without exploration."""
-        return NetworkController.of(normaliser, policy, self._decide)
-
-    def _decide(self, parameters: Params, observation: jax.Array) -> jax.Array:
-        return self._make_policy(parameters, deterministic=True)(observation, None)[0]
-
-
-class PpoLearner(BraxLearner):
+class PpoLearner:
     """``brax.training.agents.ppo.train``: a piece is one round of play and the learning from it."""
 
     def __init__(self, settings: Ppo, env: Env) -> None:
-        factory = partial(
+        self._settings, self.env = settings, env
+        self._factory = partial(
             ppo_networks.make_ppo_networks,
             policy_hidden_layer_sizes=tuple(settings.policy_layers),
             value_hidden_layer_sizes=tuple(settings.value_layers),
         )
-        super().__init__(settings, env, factory, ppo_networks.make_inference_fn)
-        self._settings = settings
+        self._networks = self._factory(
+            env.observation_size, env.action_size, preprocess_observations_fn=running_statistics.normalize
+        )
 
     def train(self, seed: int, observe: Observer) -> None:
         """As ``Learner``."""
@@ -202,84 +147,48 @@ class PpoLearner(BraxLearner):
         with brax_on_new_jax(), suppress(BudgetSpent):
             ppo.train(
                 env,
-                **self.shared,
                 seed=seed,
+                num_timesteps=ENDLESS,
+                max_devices_per_host=1,
                 wrap_env=False,
+                episode_length=1,  # of wrappers that are not used
                 num_envs=settings.environments,
                 batch_size=settings.environments // settings.minibatches,
                 num_minibatches=settings.minibatches,
                 unroll_length=settings.unroll,
                 num_updates_per_batch=settings.epochs,
+                normalize_observations=True,
+                learning_rate=settings.learning_rate,
+                discounting=settings.discount,
+                reward_scaling=settings.reward_scale,
                 gae_lambda=settings.gae_lambda,
                 clipping_epsilon=settings.clip,
                 entropy_cost=settings.entropy_cost,
                 max_grad_norm=settings.max_gradient_norm,
+                network_factory=self._factory,
                 num_evals=-(-ENDLESS // (settings.environments * settings.unroll)) + 1,  # one after each round
                 run_evals=False,
-                policy_params_fn=lambda steps, make, params: observe(self.controller(*params[:2]), env.counts()),
+                policy_params_fn=lambda steps, make, params: observe(self._controller(*params[:2]), env.counts()),
             )
 
-
-class SacLearner(BraxLearner):
-    """``brax.training.agents.sac.train``, which hands out policies in checkpoints only: the first after a piece."""
-
-    def __init__(self, settings: Sac, env: Env) -> None:
-        factory = partial(sac_networks.make_sac_networks, hidden_layer_sizes=tuple(settings.layers))
-        super().__init__(settings, env, factory, sac_networks.make_inference_fn)
-        self._settings = settings
-
-    def train(self, seed: int, observe: Observer) -> None:
+    def template(self) -> NetworkController:
         """As ``Learner``."""
-        replay, env = self._settings.replay, EpisodeCounter(self.env)
-        with brax_on_new_jax(), suppress(BudgetSpent), tempfile.TemporaryDirectory() as folder:
-
-            def look(steps: int, metrics: Any) -> None:
-                if steps:  # at 0 there is no checkpoint yet
-                    saved = Path(folder) / f"{steps:012d}"
-                    normaliser, policy = sac_checkpoint.load(saved)
-                    shutil.rmtree(saved)
-                    observe(self.controller(normaliser, policy), env.counts())
-
-            sac.train(
-                env,
-                **self.shared,
-                seed=seed,
-                wrap_env_fn=lambda env, **_: env,  # without wrap_env brax has no key
-                eval_env=NoEvaluation(self.env),
-                num_eval_envs=1,
-                num_envs=replay.environments,
-                min_replay_size=replay.random_steps,
-                max_replay_size=replay.capacity,
-                grad_updates_per_step=replay.gradient_steps,
-                batch_size=replay.batch,
-                tau=self._settings.target_rate,
-                num_evals=ENDLESS // (PIECE * replay.environments) + 1,
-                progress_fn=look,
-                checkpoint_logdir=folder,
+        size = jax.ShapeDtypeStruct((self.env.observation_size,), jnp.float32)
+        return jax.eval_shape(
+            lambda: self._controller(
+                running_statistics.init_state(size), self._networks.policy_network.init(jax.random.PRNGKey(0))
             )
+        )
 
+    def _controller(self, normaliser: NestedMeanStd, policy: Params) -> NetworkController:
+        """The policy without exploration; normaliser: brax's running statistics of the histories."""
+        scale = NestedMeanStd(jnp.array(normaliser.mean), jnp.array(normaliser.std))
+        newest = scale.mean.shape[0] // HISTORY
+        # Copies, as brax gives the memory of a state to the next one.
+        return NetworkController((scale, jax.tree.map(jnp.array, policy)), scale.mean[-newest:], self._decide)
 
-class NoEvaluation(Env):
-    """One step in an environment of that size: brax's SAC evaluates always, which is the comparison's business."""
-
-    def __init__(self, env: Env) -> None:
-        self._env = env
-
-    observation_size = property(lambda self: self._env.observation_size)
-    action_size = property(lambda self: self._env.action_size)
-    backend = property(lambda self: self._env.backend)
-
-    def reset(self, rng: jax.Array) -> State:
-        batch = jnp.zeros(rng.shape[:-1])
-        return State(None, jnp.zeros((*batch.shape, self.observation_size)), batch, batch, {}, {"steps": batch})
-
-    def step(self, state: State, action: jax.Array) -> State:
-        return state.replace(done=jnp.ones_like(state.done))
-
-
-def empty_normaliser(size: int) -> running_statistics.RunningStatisticsState:
-    """Brax's running statistics of vectors (size,), before the first."""
-    return running_statistics.init_state(jax.ShapeDtypeStruct((size,), jnp.float32))
+    def _decide(self, parameters: Params, observation: jax.Array) -> jax.Array:
+        return ppo_networks.make_inference_fn(self._networks)(parameters, deterministic=True)(observation, None)[0]
 
 
 @contextmanager

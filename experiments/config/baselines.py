@@ -89,77 +89,7 @@ class Ppo(Learning):
         return self
 
 
-class Replay(Section):
-    """Experience and its use."""
-
-    environments: Count = 64
-    """Side by side."""
-    capacity: Count = 300_000
-    """Transitions kept; once so many are there, brax's buffer moves all of them at every step (0.1 us each)."""
-    random_steps: Count = 20_000
-    """Control steps, of all environments together, with actions of chance before learning begins."""
-    gradient_steps: Count = 1
-    """After every step of all environments."""
-    batch: Count = 256
-    """Transitions of a gradient step."""
-
-
-class OffPolicy(Learning):
-    """Settings of all learners from kept experience."""
-
-    replay: Replay = Replay()
-    """Experience and its use."""
-    layers: Layers = [128, 128]
-    """Hidden units of every network's layers."""
-    learning_rate: LearningRate = 1e-3
-    discount: Discount = 0.99
-    reward_scale: RewardScale = 1.0
-    target_rate: Share = 0.005
-    """By which the target network moves towards the critic in a gradient step."""
-
-
-class Sac(OffPolicy):
-    """Soft actor-critic by brax's training function; its first steps are of the untrained policy, not random."""
-
-    kind: Literal["sac"]
-    """This algorithm."""
-    reward_scale: RewardScale = 10.0
-
-    @model_validator(mode="before")
-    @classmethod
-    def _gone(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "first_entropy_weight" in data:
-            raise ValueError(
-                "first_entropy_weight: no key any more: brax's SAC begins with 1 and adapts it; leave it out, and "
-                "weigh rewards against entropy by reward_scale"
-            )
-        return data
-
-
-class QtOpt(OffPolicy):
-    """QT-Opt in its small form: two critics, the cross-entropy method in place of an actor."""
-
-    kind: Literal["qt_opt"]
-    """This algorithm."""
-    rounds: Count = 2
-    """Of the cross-entropy method."""
-    candidates: Count = 32
-    """Actions tried in a round."""
-    elites: Count = 4
-    """Of them, the best, that decide where the next round looks."""
-    noise: Positive = 0.2
-    """Standard deviation of the exploring noise on every velocity, of which 1 is the limit."""
-    random_share: Share = 0.05
-    """Exploring steps that are wholly random."""
-
-    @model_validator(mode="after")
-    def _fewer(self) -> QtOpt:
-        if self.elites > self.candidates:
-            raise ValueError(f"elites {self.elites} are more than the candidates {self.candidates}")
-        return self
-
-
-Algorithm = Annotated[Bgs | Ppo | Sac | QtOpt, Field(discriminator="kind")]
+Algorithm = Annotated[Bgs | Ppo, Field(discriminator="kind")]
 
 
 class Budget(Section):

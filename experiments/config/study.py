@@ -23,7 +23,6 @@ from experiments.config.prior import PRIOR
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)
 Effect = Literal["rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders"]
-EFFECTS: tuple[Effect, ...] = get_args(Effect)
 Outside = Literal["lift", "bounce", "blade", "mount"]
 RIG, LOCK_STEP = "rig", "lockstep"
 FEWEST_ON_RIG = 5  # which plays in real time
@@ -100,8 +99,6 @@ class Evaluation(Section):
     """A rally that is longer ends there."""
     cross: bool = True
     """Also with the two other players of the paper's table."""
-    effects: bool = True
-    """Also in the virtual reality with one hidden effect left out at a time."""
 
 
 class Identification(Section):
@@ -146,10 +143,6 @@ class Study(Section):
     identification: Identification | None = None
     """Also the variant that learns its simulation from what each round measures; null: none. Not with
     the robot in lock-step, which logs no sessions."""
-    randomised: bool = False
-    """Also the variant that trains in worlds drawn from the prior: that of identification, or `randomise: prior`."""
-    bound: bool = False
-    """Also the variant that trains in the reality itself, as no robot can: what is to be had. Virtual reality only."""
     ablation: Ablation | None = Ablation()
     """Hand-made ball distributions against the oracle's; null: none."""
     evaluation: Evaluation = Evaluation()
@@ -198,15 +191,14 @@ class Study(Section):
                 ("fresh", self.fresh and not self.baselines),
                 ("ablation", self.ablation),
                 ("evaluation.cross", self.evaluation.cross),
-                ("evaluation.effects", self.evaluation.effects and self.robot is None),
             ):
                 if given:
                     chosen = self.baselines or "false"
                     raise ValueError(
                         f"{key}: compares the paper's models, and baselines is {chosen}; leave it out, too"
                     )
-        if not (self.baselines or self.identification or self.randomised or self.bound):
-            raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
+        if not (self.baselines or self.identification):
+            raise ValueError("baselines: false leaves nothing to do without identification")
         self._no_fine_tuning_in_vain()
         simulation = self.simulation
         later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
@@ -215,8 +207,6 @@ class Study(Section):
         for key, given_later in later.items():
             if given_later is not None:
                 experiment.refuse_unknown_terms(f"{key}.rewards", given_later.rewards)
-        if self.robot is not None and self.bound:
-            raise ValueError("bound: nobody knows all numbers of a robot; leave it false")
         missing = [player for player in self.players if player not in self.recordings]
         if self.robot not in (None, RIG) and missing:
             files = ", ".join(f"{player}: FILE" for player in missing)

@@ -10,20 +10,15 @@ the key from being read by chance, and from being changed after the rallies are 
 from __future__ import annotations
 
 import base64
-import codecs
 import csv
 import hashlib
-import itertools
 import json
-import re
 import secrets
 import shutil
 import string
 import zlib
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, replace
-from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,36 +32,27 @@ from mjx_tt.rally.end_reasons import ROWS, End
 if TYPE_CHECKING:
     from robot_io.policy.artefact import Artefact
 
-PAGE = "instructions.html"  # to print
 KEY, SHEET, POLICIES, OPENED, EVALUATIONS = "key.sealed", "sheet.csv", "policies", "key.json", "evaluations.csv"
 BEGUN = ".begun"  # while an evaluation is being made
 SHEET_COLUMNS = ("code", "rally", "length", "end")
 SEPARATORS = ",;\t"
 SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtered
-_WHOLE = re.compile("[0-9]{1,9}")
 
 
 # The bijection and its seal
 
 
-def list_codes(count: int) -> tuple[str, ...]:
-    """A, B, ... Z, AA, AB, ... in the order of testing."""
-    lengths = (map("".join, itertools.product(string.ascii_uppercase, repeat=n)) for n in itertools.count(1))
-    return tuple(itertools.islice(itertools.chain.from_iterable(lengths), count))
-
-
 def draw(models: Iterable[str], rng: np.random.Generator) -> dict[str, str]:
-    """Code name of every model, one to one, in the order in which they are to be tested.
+    """Code name A, B, ... of every model, one to one, in the order in which they are to be tested.
 
     The order is random and a code is only a place in it, so neither tells anything. Raises ValueError for a model that
-    is given twice.
+    is given twice, and for more than there are letters.
     """
     models = list(models)
-    if len(set(models)) < len(models):
-        raise ValueError(f"each model once, got {', '.join(models)}")
-    return {
-        models[k]: code for code, k in zip(list_codes(len(models)), rng.permutation(len(models)).tolist(), strict=True)
-    }
+    if len(set(models)) < len(models) or len(models) > len(string.ascii_uppercase):
+        raise ValueError(f"expected each model once, {len(string.ascii_uppercase)} at most, got {', '.join(models)}")
+    order = rng.permutation(len(models)).tolist()
+    return {models[k]: code for k, code in zip(order, string.ascii_uppercase, strict=False)}
 
 
 def seal(path: Path, content: Any) -> str:
@@ -122,15 +108,12 @@ class Progress:
         return self.counted >= scoring.KEEP
 
 
-def make(
-    folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, seed: int = 0, twice: bool = False
-) -> tuple[str, ...]:
+def make(folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, seed: int = 0) -> tuple[str, ...]:
     """Copies policies to folder/policies/CODE, writes a blank sheet, seals the key; returns the codes in order of
     testing.
 
-    policies: model key to the folder of an artefact or of a run that was exported; twice: the same policy may stand
-    under two keys. Raises ConfigError for a folder that is in use or policies that are the same, ArtefactError for one
-    that is not whole.
+    policies: model key to the folder of an artefact or of a run that was exported. Raises ConfigError for a folder that
+    is in use, ArtefactError for one that is not whole.
     """
     from robot_io.policy import artefact
 
@@ -147,8 +130,6 @@ def make(
                 f"{model}: {path} is no artefact and no run with one; export it with `mjx-tt export {path}`"
             )
     loaded = {model: artefact.load(path) for model, path in found.items()}
-    if not twice:
-        _check_different(loaded)
     key = draw(policies, np.random.default_rng())
     folder.mkdir(parents=True, exist_ok=True)
     if begun.exists():  # killed on the way: nobody has seen its codes
@@ -164,24 +145,9 @@ def make(
         "seed": seed,
     }
     write_blank_sheet(folder / SHEET, tuple(key.values()))
-    write_page(folder / PAGE, tuple(key.values()))
     seal(folder / KEY, content)
     begun.unlink()
     return tuple(key.values())
-
-
-def _check_different(loaded: dict[str, Artefact]) -> None:
-    """Raises ConfigError where two models are one policy, however often it was exported."""
-    models: dict[str, str] = {}
-    for model, policy in loaded.items():
-        numbers = (*policy.policy.parameters.values(), policy.policy.mean, policy.policy.inv_std)
-        digest = hashlib.sha256(b"".join(a.tobytes() for a in numbers)).hexdigest()
-        if digest in models:
-            raise ConfigError(
-                f"{models[digest]} and {model}: are the same policy, {loaded[models[digest]].folder} and "
-                f"{policy.folder}; each policy once"
-            )
-        models[digest] = model
 
 
 def _copy(policy: Artefact, folder: Path) -> str:
@@ -212,37 +178,12 @@ def write_blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scorin
     end-of-rally attribution), then a line for every rally."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         file.writelines(f"# {line}\n" for line in INSTRUCTIONS)
-        file.writelines(f"# {number:>2}  {description} [{who}]\n" for number, description, who in list_ends())
+        who = {True: "the robot ended it", False: "the human ended it", None: "open"}
+        for number, (_, description, ended, filtered) in enumerate(ROWS, 1):
+            file.write(f"# {number:>2}  {description} [{'not counted' if filtered else who[ended]}]\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(SHEET_COLUMNS)
         writer.writerows((code, rally, "", "") for code in tested for rally in range(1, rallies + 1))
-
-
-def list_ends() -> list[tuple[int, str, str]]:
-    """Number, description and meaning of each row of the table of ends."""
-    who = {True: "the robot ended it", False: "the human ended it", None: "open"}
-    return [
-        (number, description, "not counted" if filtered else who[ended])
-        for number, (_, description, ended, filtered) in enumerate(ROWS, 1)
-    ]
-
-
-def write_page(path: Path, tested: tuple[str, ...]) -> None:
-    """Instructions to player and evaluator, safety, consent and a sheet by hand for each code, as one page to print."""
-    told = resources.files("experiments.study.report").joinpath("templates/players.html").read_text(encoding="utf-8")
-    ends = "".join(f"<li value={n}>{escape(text)} [{who}]</li>" for n, text, who in list_ends())
-    lines = "<tr><td>&nbsp;<td><td></tr>" * (scoring.POOL + SPARE)
-    sheets = "".join(
-        f"<h2>{code}</h2><table border=1 width=100%><tr><th>rally<th>length<th>end</tr>{lines}</table>"
-        for code in tested
-    )
-    with replacing(path) as temporary:
-        temporary.write_text(
-            '<!doctype html><meta charset="utf-8"><title>Instructions</title>'
-            "<style>body{font:11pt sans-serif;max-width:18cm;margin:auto}table{page-break-after:always}</style>"
-            f"{told}<h2>Ends of rallies</h2><ol>{ends}</ol>{sheets}\n",
-            encoding="utf-8",
-        )
 
 
 def read_sheet(path: Path) -> dict[str, list[Played]]:
@@ -250,44 +191,28 @@ def read_sheet(path: Path) -> dict[str, list[Played]]:
 
     Cells may be separated by commas, semicolons or tabs: what a spreadsheet writes depends on its country.
     """
-    content = Path(path).read_bytes()
-    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
-    try:
-        lines = content.decode(encoding).splitlines()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
+    with error_context(str(path)):
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     filled = [(n, x) for n, x in enumerate(lines, 1) if x.strip() and not x.lstrip().startswith(("#", '"#'))]
     head = filled[0][1] if filled else ""
     separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
     if separator is None:
-        raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
+        raise ConfigError(f"{path}: expected the first line {','.join(SHEET_COLUMNS)}, got {head.strip()}")
     played: dict[str, list[Played]] = {}
     for number, line in filled[1:]:
         code, rally, length, end = (_cells(line, separator) + [""] * 4)[:4]
         if not any((code, rally, length, end)):
             continue
         rallies = played.setdefault(code, [])
-        if not length and not end:
-            continue
-        with error_context(f"{path}: line {number}"):
-            one = _parse_rally(rally, length, end)
-            if any(p.rally == one.rally for p in rallies):
-                raise ValueError(f"rally {rally} of {code} is there twice")
-            rallies.append(one)
+        if length or end:
+            with error_context(f"{path}: line {number}"):
+                one = Played(int(rally), int(length), scoring.parse_end(end))
+                if any(p.rally == one.rally for p in rallies):
+                    raise ValueError(f"rally {rally} of {code} is there twice")
+                if one.length < 0 or not one.length and one.end not in scoring.FILTERED:
+                    raise ValueError(f"length {length}: the human's first hit is 1, and a rally with end {end} counts")
+                rallies.append(one)
     return {code: sorted(rallies, key=lambda p: p.rally) for code, rallies in played.items()}
-
-
-def _parse_rally(rally: str, length: str, end: str) -> Played:
-    """A line of the sheet. Raises ValueError."""
-    if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
-        raise ValueError(f"rally and length are whole numbers, got {rally!r} and {length!r}")
-    try:
-        played = Played(int(rally), int(length), scoring.parse_end(end))
-    except ValueError as error:
-        raise ValueError(f"end: {error}") from None
-    if not played.length and played.end not in scoring.FILTERED:
-        raise ValueError(f"length 0: the human's first hit is 1, and a rally with end {end} counts")
-    return played
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +36,6 @@ from mjx_tt.sim.randomisation import Randomised, Range, Samples
 BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
 
 
-@dataclass(frozen=True)
-class Identified:
-    """A world to train in, and what it was made of."""
-
-    world: ModelFile
-    flights: int
-    hits: int  # 0: the rubber is drawn from the prior
-    left: Mapping[str, float]  # [rad], [m] deviation of each joint that nothing explains
-    settled: bool  # False: the fit of the balls still moved when its rounds were over
-
-
 def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     """Ranges of the prior by dotted path. Raises ValueError naming ``where`` and the path at fault."""
     found = models.from_dict({"randomise": dict(data)}, where).randomise
@@ -54,12 +43,6 @@ def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
         if not isinstance(one, Range):
             raise ValueError(f"{where}: samples; a prior has ranges")
     return tuple(one for one in found if isinstance(one, Range))
-
-
-def prior_world(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
-    """The world of a model YAML's content with these ranges in place of what it draws. Raises ValueError."""
-    plain = {key: value for key, value in model.items() if key != "randomise"}
-    return ModelFile(models.from_dict(plain, "simulation.model").model, read_prior(ranges, "identification.prior"))
 
 
 def identify(
@@ -70,8 +53,11 @@ def identify(
     hits: Sequence[Path] = (),
     seconds: float = 60.0,
     say: Callable[[str], None] = lambda text: None,
-) -> Identified:
-    """The world to train in after these logs.
+) -> ModelFile:
+    """The world to train in after these logs; its provenance says what it was made of.
+
+    Of that: flights, hits (0: the rubber is drawn from the prior), the deviation [rad], [m] of each joint that nothing
+    explains, and whether the fit of the balls settled: else it still moved when its rounds were over.
 
     most: balls that are looked at; believed: the model so far; before: ranges of what may be wrong of it, used where
     the logs say nothing, of the drives as well where no log of joints is given; hits: folders that ``write_hits`` made;
@@ -107,11 +93,14 @@ def identify(
     covered = settled | {one.path for one in before}
     others += [one for one in believed.randomise if not set(one.paths) & covered]
     centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
-    left = {} if joints_fit is None else joints_fit.left
-    flights, hit = balls_fit.problem.grid.n, 0 if hits_fit is None else hits_fit.hits
-    made_of = {"flights": flights, "hits": hit, "joints": left, PRIOR_ALONE: unseen}
-    world = ModelFile(models.with_values(balls_fit.model(), centre), (samples, *others), {"identified": made_of})
-    return Identified(world, flights, hit, left, balls_fit.posterior.converged)
+    made_of = {
+        "flights": balls_fit.problem.grid.n,
+        "hits": 0 if hits_fit is None else hits_fit.hits,
+        "joints": {} if joints_fit is None else joints_fit.left,
+        "settled": bool(balls_fit.posterior.converged),
+        PRIOR_ALONE: unseen,
+    }
+    return ModelFile(models.with_values(balls_fit.model(), centre), (samples, *others), {"identified": made_of})
 
 
 def cut_middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:

@@ -9,9 +9,8 @@ from experiments.config.files import read_yaml
 from experiments.runs.locate import SELECTION
 
 SETTINGS, SESSIONS, JOURNAL = "study.yaml", "study.json", "steps.jsonl"
-EVALUATIONS, CONVERGENCE, JOINTS, POLICY = "evaluations.csv", "convergence.json", "joints", "policy.npz"
+EVALUATIONS, JOINTS, POLICY = "evaluations.csv", "joints", "policy.npz"
 REPORT = Path("report") / "index.html"
-PRIOR, REALITY = "prior", "reality"  # worlds that need no measurement
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,8 @@ class StudyPaths:
         return self.player(seed, player) / "balls" / f"human_{name}.yaml"
 
     def world(self, seed: int, player: str, name: str) -> Path:
-        """A world as a model YAML; identified worlds and the reality belong to a player."""
-        if name == PRIOR:
-            return self.seed(seed) / f"{name}.yaml"
+        """An identified world as a model YAML."""
         return self.player(seed, player) / "identified" / f"{name}.yaml"
-
-    def evaluation_log(self, seed: int, trainer: str, evaluator: str, model: str) -> Path:
-        """The balls of an evaluation."""
-        return self.folder / "evaluations" / f"{seed}_{trainer}_{evaluator}_{model}.npz"
 
     def run(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""

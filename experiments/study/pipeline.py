@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -22,17 +21,14 @@ from ballmodel.trajectory import Dataset
 from experiments import measurements
 from experiments.config import build
 from experiments.config.study import RIG, Identification, Study
-from experiments.errors import RunError, error_context
+from experiments.errors import error_context
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
-from experiments.study import blind_protocol, evaluation, identification, training
-from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.identified import list_estimates
-from experiments.study.analysis.study_folder import ROUNDS, changes_of
-from experiments.study.paths import CONVERGENCE, EVALUATIONS, JOINTS, POLICY, PRIOR, REALITY, REPORT, StudyPaths
+from experiments.study import identification, training
+from experiments.study.analysis import scoring
+from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import (
-    ORACLE,
     Human,
     Identified,
     Item,
@@ -43,12 +39,11 @@ from experiments.study.schedule import (
     list_pairings,
 )
 from experiments.study.target_domain import hidden_effects, on_robot
-from experiments.study.target_domain.evaluation_on_robot import make_blind_steps, make_rally_step
-from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld
+from experiments.study.target_domain.play_on_robot import make_blind_steps, make_rally_step
+from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld, play_rallies
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
-from mjx_tt.sim.model import ModelFile
 
 
 class Pipeline:
@@ -80,54 +75,29 @@ class Pipeline:
 
     def _steps_of_seed(self, seed: int) -> list[Step]:
         study, found = self.study, []
-        if study.robot is None:
-            found.append(self._seal_reality(seed))
-            if study.identification is not None:
-                found.append(self._log_joints(seed, study.identification.seconds))
-        if study.randomised:
-            found.append(self._draw_prior(seed))
+        if study.robot is None and study.identification is not None:
+            found.append(self._log_joints(seed, study.identification.seconds))
         for player in study.players:
             found.append(self._first_balls(seed, player))
-            if study.bound:
-                found.append(self._copy_reality(seed, player))
             found += [self._make_item(seed, player, item) for item in list_items(study, player)]
-            if study.baselines:
-                found.append(self._measure_convergence(seed, player))
         if study.robot is None:
             found.append(self._evaluate(seed))
-            if study.evaluation.effects:
-                found.append(self._measure_effects(seed))
         else:
             found += self._play_on_rig(seed) if study.robot == RIG else self._play_blind(seed, study.robot)
         return found
 
     # -- realities and worlds
 
-    def _reality(self, seed: int) -> dict[str, Any]:
-        """Content that is sealed: the reality as plain data."""
-        without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
-        return hidden_effects.describe(hidden_effects.draw(seed, without, outside), seed, without, outside)
-
-    def _seal_reality(self, seed: int) -> Step:
-        path = self.paths.seed(seed) / "reality.sealed"
-
-        def run() -> str:
-            return f"sealed with SHA-256 {blind_protocol.seal(path, self._reality(seed))[:16]}..."
-
-        return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
-
     def _open_reality(self, seed: int) -> Step:
-        sealed, path = (self.paths.seed(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
-        inputs = (sealed, self.paths.folder / EVALUATIONS)
+        path, settings = self.paths.seed(seed) / "reality.yaml", self.study.reality
 
         def run() -> str:
-            content = blind_protocol.unseal(sealed)
-            if content != self._reality(seed):
-                raise RunError(f"{sealed}: holds another reality than the one of seed {seed} in which was played")
-            run_dir.write_yaml(path, content)
+            without, outside = tuple(settings.without), tuple(settings.outside)
+            model = hidden_effects.draw(seed, without, outside)
+            run_dir.write_yaml(path, hidden_effects.describe(model, seed, without, outside))
             return "opened"
 
-        return Step(f"seed{seed}/reality opened", "seal", 1, inputs, (path,), run)
+        return Step(f"seed{seed}/reality", (self.paths.folder / EVALUATIONS,), (path,), run)
 
     def _log_joints(self, seed: int, seconds: float) -> Step:
         folder, name = self.paths.seed(seed) / JOINTS, f"seed{seed}/{JOINTS}"
@@ -137,26 +107,7 @@ class Pipeline:
             identification.write_joints(folder, records)
             return f"{seconds:g} s of {len(records)} joints"
 
-        return Step(name, "joints", 1, (), tuple(folder / file for file in ROBOT_FILES), run)
-
-    def _draw_prior(self, seed: int) -> Step:
-        path, settings = self.paths.world(seed, "", PRIOR), self.study.identification or Identification()
-
-        def run() -> str:
-            world = identification.prior_world(self.study.simulation.model, settings.prior)
-            world.save(path)
-            return f"{len(world.randomise)} parameters drawn"
-
-        return Step(f"seed{seed}/{PRIOR}", "worlds", 1, (), (path,), run)
-
-    def _copy_reality(self, seed: int, player: str) -> Step:
-        path, name = self.paths.world(seed, player, REALITY), f"seed{seed}/{player}/{REALITY} as a world"
-
-        def run() -> str:
-            ModelFile(self._virtual[seed].add_spin(player, name)).save(path)
-            return "for the bound alone"
-
-        return Step(name, "worlds", 1, (), (path,), run)
+        return Step(name, (), tuple(folder / file for file in ROBOT_FILES), run)
 
     # -- the items of a player
 
@@ -168,7 +119,7 @@ class Pipeline:
             measurements.write_csv(path, measured)
             return f"{len(measured):,} balls without a robot"
 
-        return Step(name, "first balls", 1, (), (path,), run)
+        return Step(name, (), (path,), run)
 
     def _make_item(self, seed: int, player: str, item: Item) -> Step:
         if isinstance(item, Human):
@@ -190,7 +141,7 @@ class Pipeline:
             save_distribution(path, distribution)
             return f"fitted to {report.landing.shape[1]:,} of {report.measured:,} balls"
 
-        return Step(f"seed{seed}/{player}/{item.name}", "human model", len(sources), sources, (path,), run)
+        return Step(f"seed{seed}/{player}/{item.name}", sources, (path,), run)
 
     def _identify(self, seed: int, player: str, item: Identified) -> Step:
         settings = self.study.identification
@@ -205,16 +156,16 @@ class Pipeline:
             believed = build.believed(self.study.simulation.model)
             prior = identification.read_prior(settings.prior, "identification.prior")
             with error_context(name):
-                found = identification.identify(
+                world = identification.identify(
                     [*data, *motion], settings.balls, believed, prior, hits, settings.seconds
                 )
-            found.world.save(path)
-            count = len(list_estimates(found.world))
-            doubt = "" if found.settled else "; the balls' fit did not settle: its intervals are wider by its last step"
-            return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn{doubt}"
+            world.save(path)
+            made_of = (world.provenance or {})["identified"]
+            doubt = "" if made_of["settled"] else "; the balls' fit did not settle: its intervals are wider by its step"
+            return f"{made_of['flights']} flights, {made_of['hits']} hits{doubt}"
 
         inputs = (*data, *motion, *(folder / identification.BALLS for folder in hits))
-        return Step(name, "identification", len(data), inputs, (path,), run)
+        return Step(name, inputs, (path,), run)
 
     def _joints_of(self, seed: int, hits: tuple[Path, ...], settings: Identification) -> Path | None:
         """The log of the joints for an identification: from before the first ball; on a robot the newest play's."""
@@ -237,13 +188,10 @@ class Pipeline:
             score = self._world[seed].score(player, name)
             return training.train_seeds(self.study, item, folder, human, source, name, self.console, score, world)
 
-        simulation = self.study.simulation
-        episodes = simulation.optimiser.num_directions * simulation.optimiser.repeats
-        work = count_updates(self.study, item) * episodes * simulation.seeds
-        players_own = item.world not in (None, PRIOR)  # a world of one player is in the program
-        program = None if players_own else f"training of round {item.round} in {item.world or 'the world as believed'}"
+        # An identified world is in the program.
+        program = None if item.world else f"training of round {item.round} in the world as believed"
         compiled = Run(folder / "training" / "seed0").metrics
-        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
+        return Step(name, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
 
     def _fine_tune(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.paths.model(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
@@ -264,21 +212,8 @@ class Pipeline:
             load_policy.load(folder).policy.save(folder / POLICY)
             return text
 
-        work, inputs = count_updates(self.study, item), (self.paths.model(seed, player, item.source) / POLICY,)
-        return Step(name, "fine-tuning", work, inputs, outputs, run, "fine-tuning")
-
-    def _measure_convergence(self, seed: int, player: str) -> Step:
-        sources = tuple(self.paths.human(seed, player, name) for name in ROUNDS)
-        path = self.paths.player(seed, player) / CONVERGENCE
-
-        def run() -> str:
-            fitted = {name: load_distribution(source) for name, source in zip(ROUNDS, sources, strict=True)}
-            first, second = changes_of(fitted)
-            content = {"mean change of the 16 numbers over their ranges": {"M0-M1": first, "M1-M2": second}}
-            run_dir.write_json(path, content | {"converging": second < first})
-            return f"human model changed by {first:.1%}, then by {second:.1%} of its range"
-
-        return Step(f"seed{seed}/{player}/convergence", "convergence", 1, sources, (path,), run)
+        inputs = (self.paths.model(seed, player, item.source) / POLICY,)
+        return Step(name, inputs, outputs, run, "fine-tuning")
 
     # -- evaluations
 
@@ -288,33 +223,15 @@ class Pipeline:
         path = self.paths.seed(seed) / EVALUATIONS
 
         def run() -> str:
-            result = evaluation.play(
-                self.study, self._virtual[seed].reality, seed, pairings, *self._policies_and_balls(seed, models)
-            )
-            evaluation.save_logs(self.paths, seed, pairings, result, self.study.evaluation.lanes)
-            rallies = evaluation.score(seed, pairings, result, self.study.evaluation.lanes)
+            reality, played = self._virtual[seed].reality, self._policies_and_balls(seed, models)
+            rallies = play_rallies(self.study, reality, seed, pairings, *played)
             scoring.write(path, rallies)
-            lengths = ", ".join(f"{model} {length:.1f}" for model, length in evaluation.summarise(rallies).items())
-            return f"{len(rallies):,} rallies; mean length: {lengths}"
+            return f"{len(rallies):,} rallies, {rallies.length[~rallies.filtered].mean():.1f} touches on average"
 
         balls = sorted({(trainer, self._balls_of(trainer, model)) for trainer, model in models})
         humans = tuple(self.paths.human(seed, *one) for one in balls if one[1].startswith("M"))
         inputs = (*dict.fromkeys(self._policy_of(seed, *one) for one in models), *humans)
-        return Step(f"seed{seed}/evaluation", "evaluation", len(pairings), inputs, (path,), run)
-
-    def _measure_effects(self, seed: int) -> Step:
-        models = [(player, model) for player in self.study.players for model in effect_costs.MODELS]
-        path = self.paths.seed(seed) / effect_costs.FILE
-
-        def run() -> str:
-            reality = self._virtual[seed].reality
-            found = evaluation.play_without(self.study, reality, seed, models, *self._policies_and_balls(seed, models))
-            effect_costs.write(path, found)
-            return f"{sum(o.rallies for o in found):,} rallies in {len(effect_costs.WORLDS)} worlds"
-
-        humans = (self.paths.human(seed, player, name) for player in self.study.players for name in ROUNDS)
-        inputs = (*(self._policy_of(seed, *one) for one in models), *humans)
-        return Step(f"seed{seed}/effects", "effects", len(models) * len(effect_costs.WORLDS), inputs, (path,), run)
+        return Step(f"seed{seed}/evaluation", inputs, (path,), run)
 
     def _play_on_rig(self, seed: int) -> list[Step]:
         """The evaluation on the rig, by its virtual players."""
@@ -350,7 +267,7 @@ class Pipeline:
             scoring.write(path, rallies)
             return f"{len(rallies):,} rallies"
 
-        return Step("evaluations", "evaluations", len(sources), sources, (path,), run)
+        return Step("evaluations", sources, (path,), run)
 
     def _report(self, played: list[Step]) -> Step:
         inputs = tuple(p for step in played for p in step.outputs if p.suffix in (".csv", ".yaml", ".json"))
@@ -360,15 +277,15 @@ class Pipeline:
 
             return str(page.write(self.paths.folder))
 
-        return Step("report", "report", 1, inputs, (self.paths.folder / REPORT,), run)
+        return Step("report", inputs, (self.paths.folder / REPORT,), run)
 
     def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
-        return self.paths.model(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY
+        return self.paths.model(seed, trainer, model) / POLICY
 
     def _balls_of(self, trainer: str, model: str) -> str:
         """Name of the balls that a policy was last trained on in simulation."""
         made = {item.key: item for item in list_items(self.study, trainer) if isinstance(item, Simulated | Real)}
-        item = made["oracle-sim" if model == ORACLE else model]
+        item = made[model]
         while isinstance(item, Real):
             item = made[item.source]
         return item.balls

@@ -1,8 +1,8 @@
 """Items that a study makes for each player: human models, policies and the order in which they come about.
 
 The ten models of the paper (appendix "Evaluation Methodology"), the variant whose weights stay in simulation (its
-"Bringing the Fine-Tuned Model from the Real World Back to Simulation"), variants that train in other worlds, and the
-ablation's hand-made distributions.
+"Bringing the Fine-Tuned Model from the Real World Back to Simulation"), the variant that identifies its simulation, and
+the ablation's hand-made distributions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from experiments.config.study import Study
 from experiments.study.analysis.paper import CROSS, FINAL
-from experiments.study.paths import PRIOR, REALITY
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Simulated:
     balls   a human model, or a distribution's name
     source  model whose weights it starts from; None: from scratch
     round   whose updates and recipe it has; None: the first round's recipe with the updates of all rounds
-    world   that was identified, or PRIOR or REALITY; None: the study's model
+    world   that was identified; None: the study's model
     """
 
     key: str
@@ -70,11 +69,11 @@ Item = Human | Identified | Simulated | Real
 POLICY_SUFFIXES = (("sim1", "ft35"), ("sim2", "ft65"), ("sim3", "ft100"))  # of each round
 
 
-def loop_in(prefix: str, suffix: str, world: str | None = None, identify: bool = False) -> tuple[Item, ...]:
+def loop_in(prefix: str, suffix: str, identify: bool = False) -> tuple[Item, ...]:
     """The loop's three rounds: a human model of the balls so far, simulation, fine-tuning, which adds balls.
 
-    prefix: of the policies' keys; suffix: of the names of its own data sets and human models; world: of all
-    simulations; identify: each round first identifies its world
+    prefix: of the policies' keys; suffix: of the names of its own data sets and human models; identify: each round
+    first identifies its world
     """
     items: list[Item] = []
     data, hits = ["D0"], list[str]()
@@ -82,9 +81,8 @@ def loop_in(prefix: str, suffix: str, world: str | None = None, identify: bool =
     for number, (sim, real) in enumerate(POLICY_SUFFIXES):
         human = Human("M0" if number == 0 else f"M{number}{suffix}", tuple(data))
         items += [human] if number else []
-        if identify:
-            world = f"world{number}"
-            items.append(Identified(world, tuple(data), tuple(hits)))
+        world = f"world{number}" if identify else None
+        items += [Identified(world, tuple(data), tuple(hits))] if world else []
         added = f"D{number + 1}{suffix}" if number < 2 else None
         items.append(Simulated(f"{prefix}-{sim}", human.name, source, number, world))
         items.append(Real(f"{prefix}-{real}", f"{prefix}-{sim}", number, added, identify and added is not None))
@@ -110,7 +108,6 @@ FRESH: tuple[Item, ...] = (
     Real("fresh-ft100", "fresh-sim3", 2),
 )
 CROSS_ORDER = (FINAL[0], FINAL[2], FINAL[1])  # in which cross-evaluations are played: their chance follows from it
-ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablation
 
 
 def list_items(study: Study, player: str) -> tuple[Item, ...]:
@@ -119,8 +116,6 @@ def list_items(study: Study, player: str) -> tuple[Item, ...]:
     chosen += COMPARED if study.baselines is True else ()
     chosen += FRESH if study.fresh else ()
     chosen += loop_in("id", "-id", identify=True) if study.identification else ()
-    chosen += loop_in("prior", "-prior", PRIOR) if study.randomised else ()
-    chosen += loop_in("bound", "-bound", REALITY) if study.bound else ()
     if study.ablation and study.ablation.player == player:
         chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)
     return chosen
@@ -139,8 +134,6 @@ def list_pairings(study: Study) -> list[tuple[str, str, str]]:
     found: list[tuple[str, str, str]] = []
     for trainer in study.players:
         keys = [item.key for item in list_items(study, trainer) if isinstance(item, Simulated | Real)]
-        if study.ablation and study.ablation.player == trainer:
-            keys.append(ORACLE)
         found += [(trainer, trainer, key) for key in keys]
     if study.evaluation.cross:
         for trainer in study.players:

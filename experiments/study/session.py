@@ -8,6 +8,7 @@ depends on who does it.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +31,7 @@ from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
 from experiments.study.pipeline import Pipeline
 from experiments.study.schedule import Simulated, list_items
 from experiments.study.target_domain import on_robot
-from experiments.study.workflow import Journal, Session, Step, Waiting, perform, run_all
+from experiments.study.workflow import Journal, Step, Waiting, list_unfinished, perform
 
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
 
@@ -44,16 +45,12 @@ def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) 
     """
     folder.mkdir(parents=True, exist_ok=True)
     with Run(folder).locked():
-        if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
+        if not Journal(folder / JOURNAL).steps:  # later on, what is no longer read may be gone
             look_up(study)
         pipeline = Pipeline(study, folder, console)
         _open(study, folder)
         try:
-            steps, journal = pipeline.steps(), Journal(folder / JOURNAL)
-            if workers.alone:
-                run_all(steps, journal, console)
-            else:
-                run_side_by_side(study, folder, steps, journal, console, workers)
+            do_steps(study, folder, pipeline.steps(), console, workers)
         except Waiting as waiting:
             console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
             return False
@@ -90,7 +87,7 @@ def _open(study: Study, folder: Path) -> None:
     Where no step is done yet there is nothing that belongs to another study.
     """
     path, sessions = folder / SETTINGS, folder / SESSIONS
-    if path.exists() and Journal(folder / JOURNAL).entries:
+    if path.exists() and Journal(folder / JOURNAL).steps:
         recorded = parse(_read(path), str(path))
         changed = run_dir.differences(recorded.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
         if changed:
@@ -127,24 +124,30 @@ def choose_processes(study: Study, processes: int | None, devices: int | None) -
     return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
 
 
-def run_side_by_side(
-    study: Study, folder: Path, steps: list[Step], journal: Journal, console: Console, workers: Workers
-) -> None:
+def do_steps(study: Study, folder: Path, steps: list[Step], console: Console, workers: Workers) -> None:
     """Does what is not done yet of a study's steps, each as soon as its inputs are made and a worker is free.
 
     Ctrl-C and SIGTERM stop the workers, which save what they train, and then raise KeyboardInterrupt; so does the first
     error of a step, which is raised when the others have stopped. Raises RunError when a worker was killed.
     """
-    progress = Session(steps, journal, console, workers.count)
-    if not progress.left:
-        return
-    by_name = {step.name: step for step in progress.left}
-    setup = Setup("experiments.study.session:prepare", (study, folder))
+    journal = Journal(folder / JOURNAL)
+    left = list_unfinished(steps, journal)
+    if len(left) < len(steps):
+        console.print(f"{len(steps) - len(left)} of {len(steps)} steps were done before", highlight=False)
+    done = itertools.count(len(steps) - len(left) + 1)
 
-    def ended(job: Job, result: tuple[str, float]) -> None:
-        progress.mark(by_name[job.name], *result)
+    def ended(name: str, result: tuple[str, float]) -> None:
+        text, seconds = result
+        journal.append(name, seconds)
+        line = f"[{next(done)}/{len(steps)}] {name}: {text}  ({seconds:.1f} s)"
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
 
-    engine.run(workers.engine(setup, folder), jobs(progress.left), ended)
+    if workers.alone:
+        for step in left:
+            ended(step.name, perform(step))
+    elif left:
+        setup = Setup("experiments.study.session:prepare", (study, folder))
+        engine.run(workers.engine(setup, folder), jobs(left), lambda job, result: ended(job.name, result))
 
 
 def jobs(steps: list[Step]) -> list[Job]:

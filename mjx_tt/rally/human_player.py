@@ -3,10 +3,9 @@
 A player lobs first balls; answers a return with a stroke that depends on it; errs the more, the harder the ball is to
 play; tires; gets used to the robot. The shape of the behaviour is ours (the paper measured balls and rally lengths,
 not behaviour); its numbers, one YAML per player in ``assets/virtual_players``, are calibrated so that balls and rallies
-come near the paper's tables (docs/results/virtual-players.md, ``benchmarks/player_calibration.py``). Instructions to
-the players: appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the
-human's half (x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there
-as well.
+come near the paper's tables (docs/results/virtual-players.md). Instructions to the players: appendix "Instructions for
+Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the human's half (x > 0 for the human, who
+looks along -y) to the robot's right-hand quadrant (x > 0), returns to there as well.
 
 Component axis first, batch axes last; a player's leaves are scalars or of the batch shape. SI units.
 """

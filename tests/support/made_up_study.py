@@ -1,23 +1,20 @@
 """A study's folder with made-up numbers that are known exactly, for tests of the report and for looking at it.
 
 Rally lengths are geometric: the means of ``MEANS`` for player 3, times ``SKILL`` for the others; with another player
-they are ``KEPT`` times as long. Balls are drawn from the paper's distributions and fly with drag.
+they are ``KEPT`` times as long. Human models are the paper's.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
 import numpy as np
 
-from ballmodel import constants as c
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
-from experiments.study import blind_protocol
-from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, OTHER_WORLDS, VARIANT
+from experiments.study.analysis import scoring
+from experiments.study.analysis.paper import ABLATION, BY_SKILL, CROSS, FINAL, FRESH, IDENTIFIED, METHODS, TEN
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, SimModel
 
@@ -42,32 +39,17 @@ MEANS = {
     "id-ft65": 10.0,
     "id-sim3": 11.0,
     "id-ft100": 12.0,
-    "prior-sim1": 5.0,
-    "prior-ft35": 5.6,
-    "prior-sim2": 6.0,
-    "prior-ft65": 6.5,
-    "prior-sim3": 7.2,
-    "prior-ft100": 7.5,
-    "bound-sim1": 7.5,
-    "bound-ft35": 8.2,
-    "bound-sim2": 10.0,
-    "bound-ft65": 10.5,
-    "bound-sim3": 12.5,
-    "bound-ft100": 13.0,
     "large": 3.5,
     "medium": 5.8,
     "narrow": 3.0,
-    "oracle": 6.0,
 }
 SKILL = {"player3": 1.0, "player5": 1.4, "player4": 2.0, "player2": 2.4, "player1": 2.8}
 KEPT = {"is2r-ft100": 0.7, "s2r-ft100": 0.35, "oracle-ft": 0.65}
 RALLIES = 80
-WITHOUT = {"magnus": 1.2, "drives": 0.9, "all": 1.5}  # how many times as long the rallies are without an effect
 REALITY = {"ball.table.friction": 0.2, "ball.paddle.restitution": 0.97}
 ROBOT_SHARE = 0.85  # of the counted rallies
 FILTERED_SHARE = 0.08
 ABLATION_PLAYER = "player4"
-DRAG = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)  # [1/m] the paper's K_d
 
 
 def mean_length(player: str, model: str, own: bool = True) -> float:
@@ -76,48 +58,31 @@ def mean_length(player: str, model: str, own: bool = True) -> float:
     return 1.0 + (mean - 1.0) * (3.5 if player == "player1" and model.startswith("s2r") and own else 1.0)
 
 
-def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int = RALLIES, cross: bool = True) -> Path:
-    """Writes a study's folder; ``balls`` are the trajectories of each data set."""
+def make(folder: Path, seeds=(0,), names=BY_SKILL, rallies: int = RALLIES, cross: bool = True) -> Path:
+    """Writes a study's folder."""
     folder = Path(folder)
-    (folder / "evaluations").mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "study.yaml").write_text(f"name: made-up\nseeds: {list(seeds)}\nplayers: {list(names)}\n")
-    (folder / "study.json").write_text(
-        json.dumps({"started": "2026-11-21T20:00:00", "versions": {"numpy": np.__version__}})
-    )
     parts = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         for player in names:
-            pools = _balls(folder / f"seed{seed}" / player / "balls", player, balls, rng)
-            for key in ("is2r-ft35", "is2r-ft65", "is2r-ft100", "s2r-ft65", "s2r-ft100", "oracle-ft"):
-                _metrics(folder / f"seed{seed}" / player / key, 60 if key == "is2r-ft35" else 70, rng)
-            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *OTHER_WORLDS)]
+            models = folder / f"seed{seed}" / player / "balls"
+            models.mkdir(parents=True)
+            for name in ("M0", "M1", "M2"):
+                save_distribution(models / f"human_{name}.yaml", registry.load(f"{player}/{name}"))
+            wanted = [(player, key) for key in (*TEN, *METHODS[FRESH], *METHODS[IDENTIFIED])]
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
-            wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
+            wanted += [(player, key) for key in METHODS[ABLATION]] if player == ABLATION_PLAYER else []
             _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")
-            codes = blind_protocol.draw([f"{e}/{m}" for e, m in wanted], rng)
             for evaluator, model in wanted:
-                one = _play(seed, player, evaluator, model, codes[f"{evaluator}/{model}"], rallies, rng)
-                parts.append(one)
-                if model in (*FINAL, "is2r-ft35", "is2r-ft65"):
-                    _log(folder / "evaluations" / f"{seed}_{player}_{evaluator}_{model}.npz", one, pools[-1], rng)
-        effect_costs.write(
-            folder / f"seed{seed}" / effect_costs.FILE,
-            [
-                effect_costs.Outcome(
-                    seed, player, model, world, 60, mean_length(player, model) * WITHOUT.get(world, 1.0)
-                )
-                for player in names
-                for model in effect_costs.MODELS
-                for world in effect_costs.WORLDS
-            ],
-        )
+                parts.append(_play(seed, player, evaluator, model, rallies, rng))
         (folder / f"seed{seed}" / "reality.yaml").write_text(json.dumps({"seed": seed, "reality": REALITY}))
     scoring.write(folder / "evaluations.csv", scoring.join(parts))
     return folder
 
 
-def _play(seed, trainer, evaluator, model, code, rallies, rng) -> scoring.Rallies:
+def _play(seed, trainer, evaluator, model, rallies, rng) -> scoring.Rallies:
     mean = mean_length(trainer, model, trainer == evaluator) * np.exp(rng.normal(0.0, 0.05))
     length = 1 + rng.geometric(1.0 / max(mean - 1.0, 1.01), rallies)
     human = rng.choice([End.HUMAN_OVER_TABLE, End.ROBOT_CORNER, End.HUMAN_BOUNCES], rallies)
@@ -125,7 +90,7 @@ def _play(seed, trainer, evaluator, model, code, rallies, rng) -> scoring.Rallie
     end = np.where(rng.random(rallies) < ROBOT_SHARE, robot, human)
     dropped = rng.random(rallies) < FILTERED_SHARE
     end = np.where(dropped, rng.choice([End.FIRST_NET, End.SERVICE, End.DUMMY_BY_HAND], rallies), end)
-    return scoring.score_rallies(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
+    return scoring.score_rallies(seed, trainer, evaluator, model, "", np.where(dropped, 1, length), end)
 
 
 def _world(path: Path) -> None:
@@ -133,73 +98,3 @@ def _world(path: Path) -> None:
     path.parent.mkdir(parents=True)
     drawn = (Range("ball.table.friction", 0.19, 0.21), Range("ball.paddle.restitution", 0.8, 0.95))
     ModelFile(SimModel(), drawn).save(path)
-
-
-def _metrics(folder: Path, updates: int, rng) -> None:
-    folder.mkdir(parents=True)
-    rate = np.clip(0.3 + 0.4 * np.arange(updates) / updates + rng.normal(0.0, 0.08, updates), 0.0, 1.0)
-    rows = ({"update": k + 1, "mean_return": 2.0 + r, "return_rate": r} for k, r in enumerate(rate))
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def _log(path: Path, rallies: scoring.Rallies, balls: np.ndarray, rng) -> None:
-    """The human's balls: touches 1, 3, 5 ... of each rally; the robot does not return the last one."""
-    count = (rallies.length + 1) // 2
-    rally = np.repeat(rallies.rally, count)
-    touch = 1 + 2 * np.concatenate([np.arange(n) for n in count])
-    last = np.concatenate([np.arange(n) == n - 1 for n in count])
-    drawn = balls[:, rng.integers(0, balls.shape[1], rally.size)]
-    drawn = drawn + rng.normal(0.0, 0.01, drawn.shape)  # no two balls are the same
-    hit = ~last | (rng.random(rally.size) < 0.4)
-    back = rng.normal((0.0, 0.75), (0.35, 0.35), (rally.size, 2)).T
-    inside = (np.abs(back[0]) < c.TABLE_WIDTH / 2) & (back[1] > 0.0) & (back[1] < c.TABLE_LENGTH / 2)
-    np.savez_compressed(
-        path,
-        rally=rally,
-        touch=touch,
-        first=touch == 1,
-        position=drawn[:3],
-        velocity=drawn[3:6],
-        landing=drawn[6:],
-        hit=hit,
-        returned=hit & ~last & inside,
-        return_landing=np.where(hit, back, np.nan),
-    )
-
-
-def _balls(folder: Path, player: str, count: int, rng) -> list[np.ndarray]:
-    """Writes D0, D1, D2 and the human models; returns (8, n) of each data set."""
-    folder.mkdir(parents=True, exist_ok=True)
-    out = []
-    for dataset, model in (("D0", "M0"), ("D1", "M1"), ("D2", "M2")):
-        distribution = registry.load(f"{player}/{model}")
-        save_distribution(folder / f"human_{model}.yaml", distribution)
-        flights, points = _fly(distribution, count, rng)
-        with open(folder / f"{dataset}.csv", "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(("session", "trajectory", "t", "x", "y", "z"))
-            for k, flight in enumerate(flights):
-                writer.writerows((dataset, k, f"{t:.4f}", *(f"{v:.5f}" for v in p)) for t, p in flight)
-        out.append(points)
-    return out
-
-
-def _fly(d, count: int, rng) -> tuple[list, np.ndarray]:
-    """Balls that clear the net and land in their box: samples at 125 Hz, and (8, n) start and landing."""
-    flights, points, dt = [], [], 1.0 / 250.0
-    while len(flights) < count:
-        x = rng.uniform(d.position_min, d.position_max)
-        v = rng.uniform(d.velocity_min, d.velocity_max)
-        start, flight, step, clear = np.concatenate([x, v]), [], 0, True
-        while x[2] > c.BALL_RADIUS and x[1] > -c.TABLE_LENGTH / 2 and step < 500:
-            if step % 2 == 0:
-                flight.append((step * dt, x))
-            a = np.array([0.0, 0.0, -9.81]) - DRAG * np.linalg.norm(v) * v
-            before, x, v = x[1], x + dt * v + 0.5 * dt * dt * a, v + dt * a
-            clear &= not (before > 0.0 >= x[1] and x[2] < c.NET_HEIGHT + c.BALL_RADIUS)
-            step += 1
-        low, high = d.landing_min, d.landing_max
-        if clear and len(flight) > 8 and low[0] <= x[0] <= high[0] and low[1] <= x[1] <= high[1] and x[1] < 0:
-            flights.append(flight)
-            points.append(np.concatenate([start, x[:2]]))
-    return flights, np.array(points).T

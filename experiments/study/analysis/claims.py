@@ -6,13 +6,12 @@ over seeds and rallies (``statistics``); those of changes of the human models ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ballmodel import constants as c
 from experiments.stats import welch_interval
 from experiments.study.analysis.paper import BY_SKILL, CLAIMS, FINAL, TEN, Claim, of_level
 from experiments.study.analysis.scoring import Rallies
@@ -27,16 +26,13 @@ from experiments.study.analysis.statistics import (
     normalise_by_player,
     t_mean,
 )
-from experiments.study.analysis.study_folder import BallLog, StudyFolder, changes_of, paper_models
+from experiments.study.analysis.study_folder import StudyFolder, changes_of, paper_models
 from mjx_tt.rally.end_reasons import End
 
 WIDEST = 4.0  # high over low end of a ratio's interval that still shows "no difference": from half to double
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
 SHORT_RALLY = 5  # touches
-TUNED = {"is2r-sim1": "is2r-ft35", "is2r-sim2": "is2r-ft65", "is2r-sim3": "is2r-ft100", "oracle-sim": "oracle-ft"}
-"""Zero-shot policies, and what fine-tuning makes of them."""
-SMOOTH = 10  # updates over which a fine-tuning's return rate is averaged
 ONE_SEED = "the players of one seed alone, who share its reality"
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS = (
     "agrees",
@@ -53,13 +49,10 @@ UNITS = {
     "kept_ratio": RATIO,
     "model_change": RATIO,
     "model_change_by_level": RATIO,
-    "tuning_cost": RATIO,
     "normalised_difference": DIFFERENCE,
     "short_share_difference": DIFFERENCE,
     "longer_share": SHARE,
     "robot_ended_share": SHARE,
-    "over_share": SHARE,
-    "middle_share": SHARE,
     "mean_length": HITS,
     "longest_rally": HITS,
 }
@@ -84,23 +77,18 @@ class Finding:
 
 
 class Measurements:
-    """Statistics of a study's rallies, ball logs and human models. Bootstraps are made once.
+    """Statistics of a study's rallies and human models. Bootstraps are made once.
 
     A statistic is None where the study lacks what it needs.
     """
 
-    def __init__(self, study: StudyFolder, over_seeds: bool = True) -> None:
-        self.study, self.over_seeds = study, over_seeds
+    def __init__(self, study: StudyFolder) -> None:
+        self.study = study
 
     @cached_property
     def raw(self) -> Bootstrap:
         """Rally lengths that the paper reports, own and cross-evaluations."""
-        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds, longest=True)
-
-    @cached_property
-    def unselected(self) -> Bootstrap:
-        """Lengths of all rallies that are not filtered."""
-        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds)
+        return Bootstrap(self.study.pick(own=None, selected=False), longest=True)
 
     @cached_property
     def normalised(self) -> Bootstrap:
@@ -125,19 +113,17 @@ class Measurements:
         """All claims by their keys, in the paper's order."""
         return {claim.key: evaluate(claim, self) for claim in CLAIMS}
 
-    def length_ratio(
-        self, a: str, b: str, group: str = "all", others: bool = False, boot: Bootstrap | None = None
-    ) -> Estimate | None:
+    def length_ratio(self, a: str, b: str, group: str = "all", others: bool = False) -> Estimate | None:
         """Mean length of model a over that of b, over the players of a group that have both.
 
         others: with players who did not train the policy
         """
-        pair = (boot or self.raw).pair(a, b, of_level(group), not others)
+        pair = self.raw.pair(a, b, of_level(group), not others)
         return pair and pair[0] / pair[1]
 
-    def kept_ratio(self, models: Sequence[str], boot: Bootstrap | None = None) -> Estimate | None:
+    def kept_ratio(self, models: Sequence[str]) -> Estimate | None:
         """Mean length with other players over that with the trainer, all models together."""
-        pair = (boot or self.raw).pair(models, models, BY_SKILL, False, True)
+        pair = self.raw.pair(models, models, BY_SKILL, False, True)
         return pair and pair[0] / pair[1]
 
     def mean_length(self, model: str) -> Estimate | None:
@@ -159,7 +145,7 @@ class Measurements:
     def short_share_difference(self, a: str, b: str) -> Estimate | None:
         """Share of rallies below SHORT_RALLY of model a minus that of b."""
         rallies = self.study.pick(FINAL, selected=False)
-        boot = Bootstrap(rallies, rallies.length < SHORT_RALLY, self.over_seeds, longest=True)
+        boot = Bootstrap(rallies, rallies.length < SHORT_RALLY, longest=True)
         return self._difference(boot, a, b, "all", False)
 
     def longer_share(self, a: str, b: str) -> Estimate | None:
@@ -176,27 +162,7 @@ class Measurements:
         rallies = self.study.pick(TEN, selected=False)
         rallies = rallies.take(rallies.end != End.NONE)
         ended = (rallies.robot_ended == 1) | np.isin(rallies.end, (End.ROBOT_GRAZES_NET, End.ROBOT_CORNER))
-        return Bootstrap(rallies, ended, self.over_seeds).mean(TEN, BY_SKILL)
-
-    def over_share(self, model: str, group: str) -> Estimate | None:
-        """Of the balls that were not returned, the share hit over the human's end line."""
-
-        def choose(log: BallLog) -> tuple[np.ndarray, np.ndarray]:
-            with np.errstate(invalid="ignore"):
-                far = log.hit.astype(bool) & (log.return_landing[1] > c.TABLE_LENGTH / 2)
-            return far, np.isfinite(log.landing).all(axis=0) & ~log.returned.astype(bool)
-
-        return self._ball_share(model, of_level(group), choose)
-
-    def middle_share(self, model: str, player: str, touched: bool = False) -> Estimate | None:
-        """Share of the balls that bounce in the middle ninth of the robot's half; touched: by the robot."""
-
-        def choose(log: BallLog) -> tuple[np.ndarray, np.ndarray]:
-            x, y = log.landing
-            inside = (np.abs(x) <= c.TABLE_WIDTH / 6) & (np.abs(y + c.TABLE_LENGTH / 4) <= c.TABLE_LENGTH / 12)
-            return inside, np.isfinite(x) & np.isfinite(y) & (log.hit.astype(bool) | (not touched))
-
-        return self._ball_share(model, (player,), choose)
+        return Bootstrap(rallies, ended).mean(TEN, BY_SKILL)
 
     def model_change(self, group: str = "all") -> Interval | None:
         """Second change of the human model over the first, over the players of a group."""
@@ -205,26 +171,6 @@ class Measurements:
     def model_change_by_level(self) -> Interval | None:
         """Second change of the human model, beginners over intermediate players."""
         return model_change_by_level(self.changes)
-
-    def tuning_cost(self) -> Interval | None:
-        """Updates of fine-tuning after a player's worst zero-shot policy over those after the best, to an equal level.
-
-        The level is the highest return rate, averaged over SMOOTH updates, that all of the player's fine-tunings reach.
-        """
-        logs = {}
-        for seed, player in ((s, p) for s in self.study.seeds for p in self.study.players):
-            found = []
-            for zero_shot, tuned in TUNED.items():
-                length = self.raw.point.get((seed, player, player, zero_shot))
-                rates = [row["return_rate"] for row in self.study.metrics(seed, player, tuned)]
-                if length is not None and len(rates) >= SMOOTH:
-                    found.append((length, np.convolve(rates, np.full(SMOOTH, 1.0 / SMOOTH), "valid")))
-            if len(found) > 1:
-                level = min(rates.max() for _, rates in found)
-                (_, worst), *_, (_, best) = sorted(found, key=lambda pair: pair[0])
-                taken = [int(np.argmax(rates >= level)) + SMOOTH for rates in (worst, best)]
-                logs[seed, player] = float(np.log(taken[0] / taken[1]))
-        return _geometric_mean(logs)
 
     def _difference(self, boot: Bootstrap, a: str, b: str, group: str, others: bool) -> Estimate | None:
         """Mean of a minus mean of b; ``larger`` is of the rally lengths."""
@@ -235,26 +181,7 @@ class Measurements:
 
     def _finite(self, rallies: Rallies, values: np.ndarray) -> Bootstrap:
         good = np.isfinite(values)
-        return Bootstrap(rallies.take(good), values[good], self.over_seeds, longest=True)
-
-    def _ball_share(
-        self, model: str, trainers: Iterable[str], choose: Callable[[BallLog], tuple[np.ndarray, np.ndarray]]
-    ) -> Estimate | None:
-        """A share of the balls of own evaluations, all seeds together; whole rallies are drawn anew.
-
-        choose: of a log, which balls are in the share, and which are counted at all, both (n,) bool.
-        """
-        tables = []
-        for log in (log for trainer in trainers for log in self.study.logs(trainer, model)):
-            inside, counted = choose(log)
-            _, rally = np.unique(log.rally, return_inverse=True)
-            tables.append(np.array([np.bincount(rally, inside & counted), np.bincount(rally, counted)]))
-        table = np.concatenate(tables, axis=1) if tables else np.zeros((2, 0))
-        if not table[1].sum():
-            return None
-        drawn = table[:, np.random.default_rng(0).integers(0, table.shape[1], (DRAWS, table.shape[1]))].sum(axis=2)
-        share = float(table[0].sum() / table[1].sum())
-        return Estimate(share, drawn[0] / np.maximum(drawn[1], 1), int(table[1].sum()))
+        return Bootstrap(rallies.take(good), values[good], longest=True)
 
 
 def model_change(changes: Changes, group: str = "all") -> Interval | None:

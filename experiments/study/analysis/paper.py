@@ -14,22 +14,6 @@ _DATA = yaml.safe_load(resources.files(__package__).joinpath("paper.yaml").read_
 
 
 @dataclass(frozen=True)
-class Model:
-    """One trained policy of a player.
-
-    key: name in a study's folder; label: the paper's; method: IS2R, S2R, ...
-    """
-
-    key: str
-    label: str
-    method: str
-
-    @property
-    def fine_tuned(self) -> bool:
-        return self.key.split("-")[-1].startswith("ft")
-
-
-@dataclass(frozen=True)
 class Claim:
     """Something that the paper says, and how it is measured and judged; the keys are explained in ``paper.yaml``."""
 
@@ -41,21 +25,15 @@ class Claim:
     expect: str
     paper: float | None = None
     of: dict[str, Any] = field(default_factory=dict)
-    summary: dict[str, str] | None = None
 
 
-METHODS: dict[str, tuple[Model, ...]] = {
-    method: tuple(Model(key, label, method) for key, label in content["models"].items())
-    for method, content in _DATA["methods"].items()
-}
+METHODS: dict[str, tuple[str, ...]] = {key: tuple(content["models"]) for key, content in _DATA["methods"].items()}
+"""Models of each method in the order of training, by their names in a study's folder."""
 COLOURS: dict[str, str] = {method: content["colour"] for method, content in _DATA["methods"].items()}
 LEGEND: dict[str, str] = {method: content["legend"] for method, content in _DATA["methods"].items()}
-IS2R, S2R, ORACLE, FRESH, RANDOMISED, IDENTIFIED, BOUND, ABLATION = METHODS
-BY_KEY = {model.key: model for models in METHODS.values() for model in models}
-MODELS = METHODS[IS2R] + METHODS[S2R] + METHODS[ORACLE]
-VARIANT, ABLATED = METHODS[FRESH], METHODS[ABLATION]
-OTHER_WORLDS = METHODS[RANDOMISED] + METHODS[IDENTIFIED] + METHODS[BOUND]
-TEN = tuple(model.key for model in MODELS)
+IS2R, S2R, ORACLE, FRESH, IDENTIFIED, ABLATION = METHODS
+METHOD_OF = {model: method for method, models in METHODS.items() for model in models}
+TEN = METHODS[IS2R] + METHODS[S2R] + METHODS[ORACLE]
 SHORT: dict[str, str] = _DATA["final"]
 LAST = tuple(SHORT)
 FINAL = LAST[:3]

@@ -9,7 +9,6 @@ reported, five sixths: to take 50 of 52 and 50 of 60 would favour the policy tha
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -144,45 +143,23 @@ def write(path: Path, rallies: Rallies) -> None:
 def read(path: Path) -> Rallies:
     """Reads evaluations.csv. What counts follows from lengths and ends, so a sheet edited by hand is scored anew.
 
-    Raises ConfigError naming file, line and column.
+    Raises ConfigError naming file and line.
     """
     evaluations: dict[tuple[int, str, str, str, str], list[tuple[int, int, End]]] = {}
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS[:8] if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ConfigError(f"{path}: column {', '.join(missing)} is missing; wanted: {', '.join(COLUMNS)}")
-            for row in reader:
-                with error_context(f"{path}: line {reader.line_num}"):
-                    trainer, evaluator, model = (_name(row, column) for column in ("trainer", "evaluator", "model"))
-                    group = (_whole(row, "seed"), trainer, evaluator, model, row["blind"] or "")
-                    evaluations.setdefault(group, []).append((_whole(row, "rally"), _whole(row, "length"), _end(row)))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
+    with error_context(str(path)), open(path, newline="", encoding="utf-8-sig") as file:
+        rows = list(csv.DictReader(file, restval=""))
+    for number, row in enumerate(rows, 2):
+        try:
+            group = (int(row["seed"]), row["trainer"], row["evaluator"], row["model"], row["blind"])
+            played = (int(row["rally"]), int(row["length"]), End[row["end"].strip().upper()])
+            if not all(group[1:4]) or played[1] < 0:
+                raise ValueError("names and lengths are needed")
+        except (KeyError, ValueError) as error:
+            wanted = f"wanted are {', '.join(COLUMNS[:8])}, an end as {', '.join(e.name.lower() for e in End)}"
+            raise ConfigError(f"{path}: line {number}: {error}; {wanted}") from None
+        evaluations.setdefault(group, []).append(played)
     parts = []
-    for group, played in evaluations.items():
-        numbers, lengths, ends = zip(*sorted(played, key=lambda p: p[0]), strict=True)
+    for group, played_ones in evaluations.items():
+        numbers, lengths, ends = zip(*sorted(played_ones, key=lambda p: p[0]), strict=True)
         parts.append(replace(score_rallies(*group, lengths, ends), rally=np.array(numbers)))
     return join(parts)
-
-
-def _name(row: dict[str, str], column: str) -> str:
-    if not row[column]:
-        raise ValueError(f"column {column}: a name is wanted, got nothing")
-    return row[column]
-
-
-def _whole(row: dict[str, str], column: str) -> int:
-    text = (row[column] or "").strip()
-    if not re.fullmatch("[0-9]{1,9}", text):
-        raise ValueError(f"column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")
-    return int(text)
-
-
-def _end(row: dict[str, str]) -> End:
-    try:
-        return End[(row["end"] or "").strip().upper()]
-    except KeyError:
-        names = ", ".join(e.name.lower() for e in End)
-        raise ValueError(f"column end: {row['end'] or ''!r} is none of {names}") from None

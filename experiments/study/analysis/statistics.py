@@ -1,27 +1,27 @@
-"""Means, differences and ratios of rally lengths with 95 % intervals, normalised rally lengths, tests of differences.
+"""Means, differences and ratios of rally lengths with 95 % intervals, and normalised rally lengths.
 
-Three sources of chance are kept apart. Student's t over the pooled rallies is the paper's way. The bootstrap over
-rallies draws them anew within each policy. The bootstrap over seeds draws the study's repetitions anew as well, so that
-its interval holds for a policy that is trained again; players are always the same ones. Of fewer than FEWEST_SEEDS
-seeds it would draw a handful of points, which are no 95 %: there it is the bootstrap over rallies.
+The bootstrap draws rallies anew within each policy, and the
+study's repetitions (seeds) as well, so that its interval holds for a policy that is trained again; players are always
+the same ones. Of fewer than FEWEST_SEEDS seeds it would draw a handful of points, which are no 95 %: there it draws
+rallies alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import ArrayLike
 
-from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
+from experiments.stats import t_interval
 from experiments.study.analysis.scoring import Rallies, count_reported
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
-PERMUTATIONS = 4000
-Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
+CELL = ["seed", "trainer", "evaluator", "model"]
+Cell = tuple[int, str, str, str]
 Models = str | Iterable[str]  # one or several
 
 
@@ -74,7 +74,8 @@ class Estimate:
     def __truediv__(self, other: Estimate) -> Estimate:
         with np.errstate(divide="ignore", invalid="ignore"):
             draws = np.nan_to_num(self.draws / other.draws, nan=np.inf)
-        return Estimate(_ratio(self.value, other.value), draws, self.n, max(self.value, other.value))
+        value = self.value / other.value if other.value else float("inf")
+        return Estimate(value, draws, self.n, max(self.value, other.value))
 
 
 class Bootstrap:
@@ -92,7 +93,6 @@ class Bootstrap:
         self,
         rallies: Rallies,
         values: np.ndarray | None = None,
-        over_seeds: bool = True,
         draws: int = DRAWS,
         key: int = 0,
         longest: bool = False,
@@ -102,18 +102,19 @@ class Bootstrap:
         rng = np.random.default_rng(key)
         reported = rallies.selected if longest else np.ones(len(rallies), bool)
         self.cells = group_by_cell(rallies.take(reported), values[reported])
-        self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
-        self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         pooled = rallies.pooled if longest else reported
         order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
-        self._draws: dict[Cell, Any] = {
+        drawn = {
             cell: _means(v, count_reported(v.size) if longest else v.size, draws, rng)
             for cell, v in group_by_cell(rallies.take(order), values[order]).items()
         }
+        # A row for each cell: its mean, then the draws of it.
+        rows = [np.append(self.cells[cell].mean(), means) for cell, means in drawn.items()]
+        index = pandas.MultiIndex.from_tuples(drawn, names=CELL) if drawn else None
+        self._table = pandas.DataFrame(rows, index)
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
-        self._chosen = {
-            s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, len(self.seeds) + 1) if over_seeds
-        }
+        seeds = len({cell[0] for cell in self.cells})
+        self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, seeds + 1)}
 
     def mean(self, models: Models, trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
         """Mean over the models' cells of a trainer, then over trainers, then over seeds; None where there is no cell.
@@ -149,20 +150,10 @@ class Bootstrap:
         return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
 
     def _mean(self, found: list[Cell]) -> Estimate:
-        """Mean over cells, at least one."""
-        groups: dict[int, dict[str, list[Cell]]] = {}
-        for cell in found:
-            groups.setdefault(cell[0], {}).setdefault(cell[1], []).append(cell)
-        points, draws = (
-            np.array(
-                [
-                    np.mean([np.mean([table[c] for c in members], axis=0) for members in by_trainer.values()], axis=0)
-                    for by_trainer in groups.values()
-                ]
-            )
-            for table in (self.point, self._draws)
-        )
-        chosen = self._chosen.get(len(groups))
+        """Mean over the cells (at least one) of a trainer, then over trainers, then over seeds."""
+        by_seed = self._table.loc[found].groupby(level=["seed", "trainer"]).mean().groupby(level="seed").mean()
+        points, draws = by_seed.iloc[:, 0].to_numpy(), by_seed.iloc[:, 1:].to_numpy()
+        chosen = self._chosen.get(len(draws))
         drawn = draws.mean(axis=0) if chosen is None else np.take_along_axis(draws, chosen, axis=0).mean(axis=0)
         return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))
 
@@ -177,11 +168,8 @@ def _means(values: np.ndarray, first: int, draws: int, rng: np.random.Generator)
 
 def group_by_cell(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
-    groups: dict[Cell, list[int]] = {}
-    columns = (getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model"))
-    for i, cell in enumerate(zip(*columns, strict=True)):
-        groups.setdefault(cell, []).append(i)
-    return {cell: values[index] for cell, index in groups.items()}
+    keys = [getattr(rallies, name) for name in CELL]
+    return {cell: group.to_numpy() for cell, group in pandas.Series(values).groupby(keys, sort=False)}
 
 
 def normalise_by_player(rallies: Rallies) -> np.ndarray:
@@ -204,33 +192,10 @@ def normalise_by_model(rallies: Rallies) -> np.ndarray:
 
 def _standardise(rallies: Rallies, group: Sequence[str], reference: np.ndarray) -> np.ndarray:
     """(n,) lengths standardised by the reference rallies, (n,) bool, of their group."""
-    out, columns = np.full(len(rallies), np.nan), [getattr(rallies, name) for name in group]
-    for names in set(zip(*(column.tolist() for column in columns), strict=True)):
-        members = np.all([column == name for column, name in zip(columns, names, strict=True)], axis=0)
-        base = rallies.length[members & reference].astype(float)
-        if base.size > 1 and base.std(ddof=1) > 0.0:
-            out[members] = (rallies.length[members] - base.mean()) / base.std(ddof=1)
-    return out
-
-
-def estimate_share(held: Iterable[tuple[int, bool]]) -> Interval:
-    """Share of what holds, (seed, true or false) each, with percentiles of a bootstrap over seeds.
-
-    What belongs to one seed shares its reality and its logs, so that seeds alone are drawn anew, S - 1 of S; without an
-    interval (NaN) where there are fewer than FEWEST_SEEDS.
-    """
-    table: dict[int, list[int]] = {}
-    for seed, true in held:
-        counts = table.setdefault(seed, [0, 0])
-        counts[0] += true
-        counts[1] += 1
-    count = np.array(list(table.values())).T  # (2, S) that hold, and all
-    value, seeds = float(count[0].sum() / count[1].sum()), count.shape[1]
-    if seeds < FEWEST_SEEDS:
-        return Interval(value, np.nan, np.nan, int(count[1].sum()))
-    drawn = count[:, np.random.default_rng(0).integers(0, seeds, (seeds - 1, DRAWS))].sum(axis=1)
-    low, high = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
-    return Interval(value, float(low), float(high), int(count[1].sum()))
+    length, keys = pandas.Series(rallies.length.astype(float)), [getattr(rallies, name) for name in group]
+    base = length.where(reference).groupby(keys)
+    spread = base.transform("std")
+    return ((length - base.transform("mean")) / spread.where(spread > 0.0)).to_numpy()
 
 
 def average_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
@@ -255,66 +220,5 @@ def t_mean(values: ArrayLike) -> Interval:
     return Interval(*t_interval(values), values.size)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Mean of one set of policies minus that of another, with what speaks for it.
-
-    bootstrap: over seeds, if there are enough, and rallies; welch: t interval over the pooled rallies, the paper's way
-    p_welch, p_rallies: two-sided, a rally is the unit (Welch's t; permutation within each pair of policies)
-    p_policies: two-sided, a pair of policies (one seed, one player) is the unit; ``pairs`` of them
-    """
-
-    bootstrap: Interval
-    welch: Interval
-    p_welch: float
-    p_rallies: float
-    p_policies: float
-    pairs: int
-
-
-def compare_models(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bool = True) -> Difference | None:
-    """Of model ``a`` minus model ``b``, over pairs of cells that differ in the model only."""
-    trainers = tuple(trainers)
-    pairs = [
-        (boot.cells[cell], boot.cells[(*cell[:3], b)])
-        for cell in boot.cells
-        if cell[3] == a and cell[1] in trainers and _is(own, cell) and (*cell[:3], b) in boot.cells
-    ]
-    both = boot.pair(a, b, trainers, own)
-    if both is None or not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
-        return None
-    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return Difference(
-        (both[0] - both[1]).interval,
-        Interval(*welch_interval(second, first), first.size + second.size),
-        welch_p(first, second),
-        permute_rallies(pairs),
-        sign_flip([x.mean() - y.mean() for x, y in pairs]),
-        len(pairs),
-    )
-
-
-def permute_rallies(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
-    """Two-sided p of the mean difference over pairs of samples, whose members are exchanged within each pair.
-
-    The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010). SciPy's
-    permutation_test has no pairs of samples of different sizes.
-    """
-    rng = np.random.default_rng(key)
-    observed, drawn = 0.0, np.zeros(draws)
-    for x, y in pairs:
-        both = np.concatenate([x, y])
-        order = rng.permuted(np.broadcast_to(np.arange(both.size), (draws, both.size)), axis=1)
-        mixed = both[order]
-        observed += x.mean() - y.mean()
-        drawn += mixed[:, : x.size].mean(axis=1) - mixed[:, x.size :].mean(axis=1)
-    extreme = np.abs(drawn) >= abs(observed) * (1.0 - 1e-12)
-    return float((extreme.sum() + 1) / (draws + 1))
-
-
 def _is(own: bool | None, cell: Cell) -> bool:
     return own is None or (cell[1] == cell[2]) == own
-
-
-def _ratio(a: float, b: float) -> float:
-    return a / b if b else float("inf")

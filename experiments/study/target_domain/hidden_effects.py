@@ -5,8 +5,7 @@ left out keeps what training believes. The draw depends on the seed and on the p
 effect changes no other. Balls spin as the player hits them; training believes that none does. Effects from outside of
 the model's class are added only where a study names them.
 
-What was drawn is sealed (``study.blind_protocol``) when a study begins and opened when it is over. The learner gets
-measured balls and rewards.
+What was drawn is written down when a study is over. The learner gets measured balls and rewards.
 """
 
 from __future__ import annotations
@@ -120,15 +119,6 @@ def _uniform(seed: int, path: str, low: float, high: float) -> float:
     return float(np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(low, high))
 
 
-def stack_worlds(worlds: list[SimModel], sessions: int) -> SimModel:
-    """All worlds in one model, each for as many neighbouring sessions: what differs is (worlds * sessions,)."""
-    values = [models.paths(world) for world in worlds]  # also of drives that a world does not have
-    differ = [path for path in values[0] if len({v[path] for v in values}) > 1]
-    return models.with_values(
-        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), sessions) for path in differ}
-    )
-
-
 def list_differences(model: SimModel) -> dict[str, float]:
     """Values of a reality that differ from what training believes, by dotted path."""
     nominal = models.paths()
@@ -136,7 +126,7 @@ def list_differences(model: SimModel) -> dict[str, float]:
 
 
 def describe(model: SimModel, seed: int, without: tuple[str, ...], outside: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Content to be sealed: plain data."""
+    """The reality as plain data."""
     found: dict[str, Any] = {"seed": seed, "without": list(without), "reality": list_differences(model)}
     return found | ({"outside": list(outside)} if outside else {})
 

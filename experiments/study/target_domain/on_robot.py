@@ -28,9 +28,9 @@ from experiments.finetuning.robot import SCENE, BallRecorder
 from experiments.options import LOCK_STEP, RIG, RobotOptions
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.study.target_domain import selection_on_robot
-from experiments.study.target_domain.evaluation_on_robot import derive_seed
+from experiments.study.target_domain import play_on_robot
 from experiments.study.target_domain.hit_log import HitLog
+from experiments.study.target_domain.play_on_robot import derive_seed
 from experiments.study.workflow import Waiting
 from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
 from robot_io.emulator.config import RigParams
@@ -123,7 +123,7 @@ class RobotWorld:
         if simulation.seeds == 1:
             return None
         self._console.print(f"{name}: {player} to the table", highlight=False)
-        return lambda p: selection_on_robot.score(p, self._robot, simulation.selection_episodes, seed, self._console)
+        return lambda p: play_on_robot.score(p, self._robot, simulation.selection_episodes, seed, self._console)
 
 
 class StandStill:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +25,7 @@ from jaxtyping import PRNGKeyArray
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.partial_params import without_nominal
+from ballmodel.registry import Balls
 from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
 from bgs.normalizer import ObservationStatistics
@@ -35,7 +36,7 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
-from experiments.study.analysis import delays
+from experiments.study.analysis import delays, scoring
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
 from experiments.study.target_domain.hit_log import HitLog
 from experiments.training.update import TrainState
@@ -45,14 +46,13 @@ from mjx_tt.env.policy import Policy
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.human_player import Player
-from mjx_tt.rally.simulator import RallySimulator, RallyState, ShotResult
+from mjx_tt.rally.simulator import Box, RallySimulator, RallyState, ShotResult
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
 SELECTION_SESSIONS = 10  # side by side in which policies are compared
 ATTEMPTS = 100  # of a ball, after which a player who brings none onto the robot's half is taken as they are
-STROKES = 512  # from which the spin of a player's strokes is known
-STUDY = 6  # purpose of a key, beside those of experiments.config.build
+STUDY, EVALUATION = 6, 7  # purposes of keys, beside those of experiments.config.build
 
 
 @dataclass(frozen=True)
@@ -236,15 +236,46 @@ class VirtualReality:
         }
 
 
-def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
-    """The reality's model with mean and spread of the spin of a player's strokes."""
-    state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
-    spin = np.asarray(state.ball.spin)
-    mean, std = (
-        {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
-        for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
+def play_rallies(
+    study: Study,
+    reality: VirtualReality,
+    seed: int,
+    pairings: Sequence[tuple[str, str, str]],
+    policies: Sequence[Policy],
+    balls: Sequence[Balls],
+) -> scoring.Rallies:
+    """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` parallel sessions, in turn.
+
+    balls: what each policy was trained for
+    """
+    sessions, settings = study.evaluation.lanes, study.evaluation
+    people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
+    policy, box = _stack(policies, balls, sessions)
+    result = reality.simulator.play(
+        policy,
+        jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), people),
+        reality.known,
+        build.key(seed, EVALUATION),
+        settings.rallies // sessions,
+        box,
+        settings.max_touches,
     )
-    return models.with_values(reality.model, mean | std)
+    # (rallies of a session, sessions of all pairings): those of a pairing count as one session.
+    each = zip(*(np.split(np.asarray(x), len(pairings), axis=1) for x in (result.length, result.end)), strict=True)
+    return scoring.join(
+        scoring.score_rallies(seed, *pairing, "", length.ravel(), end.ravel())
+        for pairing, (length, end) in zip(pairings, each, strict=True)
+    )
+
+
+def _stack(policies: Sequence[Policy], balls: Sequence[Balls], sessions: int) -> tuple[Policy, Box]:
+    """Policies and the boxes of their balls, one (..., n * sessions) array each, the sessions of one side by side."""
+
+    def stack(*arrays: ArrayLike) -> Array:
+        return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), sessions, axis=-1)
+
+    boxes = [Box.of(one) for one in balls]
+    return jax.tree.map(stack, *policies), Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes)))
 
 
 class VirtualWorld:
@@ -261,10 +292,6 @@ class VirtualWorld:
         return self.reality.first_balls(
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
-
-    def add_spin(self, player: str, name: str) -> SimModel:
-        """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
-        return add_spin(self.reality, player, self._key(name))
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
@@ -289,11 +316,8 @@ class VirtualWorld:
         with replacing(run.metrics) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in cycle.rows), encoding="utf-8")
         checkpoint.save(run.checkpoints, real_updates, cycle.state, {"seconds": 0.0})
-        tenth = max(1, real_updates // 10)
-        first, last = (
-            sum(r["return_rate"] for r in part) / tenth for part in (cycle.rows[:tenth], cycle.rows[-tenth:])
-        )
-        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {first:.0%} at first, {last:.0%} at last"
+        rates = [row["return_rate"] for row in cycle.rows]
+        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {np.mean(rates):.0%}"
         return Dataset(cycle.balls, name), text
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +10,14 @@ import numpy as np
 import pytest
 import yaml
 from brax.envs.base import Env, State
-from brax.training.types import Transition
 from rich.console import Console
 
 from ballmodel import registry
 from experiments.baselines import compare
-from experiments.baselines.learners import BudgetSpent, PpoLearner, SacLearner
-from experiments.baselines.qt_opt import QtOptLearner, best_action
+from experiments.baselines.learners import BudgetSpent, PpoLearner
 from experiments.config import baselines
 from experiments.config import experiment as config
-from experiments.config.baselines import Ppo, QtOpt, Replay, Sac
+from experiments.config.baselines import Ppo
 from experiments.config.site import Site
 from experiments.errors import ConfigError, RunError
 from experiments.jobs.site import ALONE, Workers
@@ -58,39 +54,13 @@ def best(observation):
     return jnp.clip(observation @ WEIGHTS, -0.8, 0.8)
 
 
-REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_steps=2, batch=128)
-
-
 @pytest.mark.optimised
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "learner, pieces, steps, left",
-    [
-        (
-            PpoLearner(
-                Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
-            ),
-            120,
-            120 * 256 * 4,
-            0.4,
-        ),
-        (
-            SacLearner(Sac(kind="sac", layers=[64, 64], replay=REPLAY), Aim()),
-            5,
-            2000 + 5 * 512 * 16,
-            0.4,
-        ),
-        (
-            QtOptLearner(QtOpt(kind="qt_opt", layers=[64, 64], replay=REPLAY), Aim()),
-            5,
-            2000 + 5 * 512 * 16,
-            0.6,
-        ),
-    ],
-    ids=["PPO", "SAC", "QT-Opt"],
-)
-def test_a_learner_comes_near_the_best_action(learner, pieces, steps, left):
-    """``left``: share of the squared distance that standing still leaves."""
+def test_ppo_comes_near_the_best_action():
+    learner = PpoLearner(
+        Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
+    )
+    pieces, steps = 120, 120 * 256 * 4
     seen = []
 
     def observe(controller, counts):
@@ -101,63 +71,14 @@ def test_a_learner_comes_near_the_best_action(learner, pieces, steps, left):
     learner.train(0, observe)
     assert [counts["steps"] > 0 for _, counts in seen].count(True) == pieces
     controller, counts = seen[-1]
-    assert counts["episodes"] == counts["steps"] == steps and counts["episode_return"] < 0
+    assert counts["episodes"] == counts["steps"] == steps
     template = learner.template()
     assert jax.tree.map(jnp.shape, controller) == jax.tree.map(jnp.shape, template)
     observation = jax.random.normal(jax.random.key(9), (500, OBSERVATION_SIZE))
     action = controller.decide(controller.parameters, observation)
     assert np.abs(action).max() <= 1.0
     distance = np.mean((action - best(observation)) ** 2) / np.mean(best(observation) ** 2)
-    assert distance < left
-
-
-def test_the_search_finds_the_best_action():
-    target = jnp.asarray(np.random.default_rng(1).uniform(-0.9, 0.9, (20, N_JOINTS)), jnp.float32).at[0].set(1.5)
-    normals = jax.random.normal(jax.random.key(0), (12, 200, N_JOINTS))
-    found = best_action(lambda a: -jnp.sum((a - target[:, None]) ** 2, axis=-1), normals, 15)
-    assert found.shape == target.shape
-    # The first lies outside of what is allowed: there the nearest corner is the best.
-    np.testing.assert_allclose(found, np.clip(target, -1, 1), atol=0.05)
-
-
-def test_qt_opt_fits_the_clipped_double_target():
-    """One gradient step against the formula written out: r + gamma (1 - end) min Q'(s', best action of Q'_1)."""
-    settings = {"layers": [8], "discount": 0.9, "reward_scale": 0.5, "target_rate": 0.25, "learning_rate": 3e-4}
-    learner = QtOptLearner(QtOpt(kind="qt_opt", replay=REPLAY, **settings), Aim())
-    state = learner.init(jax.random.PRNGKey(0))  # observations are normalised by mean 0, deviation 1
-    rng = np.random.default_rng(3)
-    seen, following = rng.normal(size=(2, 6, OBSERVATION_SIZE)).astype(np.float32)
-    action = rng.uniform(-1, 1, (6, N_JOINTS)).astype(np.float32)
-    reward, discount = rng.normal(size=6).astype(np.float32), np.array([1, 1, 0, 1, 0, 1], np.float32)
-    normals = jax.random.normal(jax.random.key(4), (2, 32, N_JOINTS))
-
-    def q(parameters, observation, action):
-        """Both critics from their weights."""
-        values = []
-        for critic in ("MLP_0", "MLP_1"):
-            first, last = (parameters["params"][critic][f"hidden_{i}"] for i in range(2))
-            x = jnp.concatenate([observation, action], axis=-1)
-            hidden = jnp.maximum(x @ first["kernel"] + first["bias"], 0.0)
-            values.append((hidden @ last["kernel"] + last["bias"])[..., 0])
-        return jnp.stack(values, axis=-1)
-
-    def worth(a):
-        return q(state.target, jnp.broadcast_to(following[:, None], (6, a.shape[-2], OBSERVATION_SIZE)), a)[..., 0]
-
-    chosen = best_action(lambda a: worth(jnp.broadcast_to(a, (6, *a.shape[-2:]))), normals, 4)
-    wanted = 0.5 * reward + 0.9 * discount * np.min(q(state.target, following, chosen), axis=-1)
-    batch = Transition(seen, action, reward, discount, following, {})
-    np.testing.assert_allclose(learner.wanted(state, batch, normals), wanted, rtol=1e-5, atol=1e-6)
-    after = learner.update(state, batch)
-    drawn = learner.wanted(state, batch, learner._draw(jax.random.split(state.key)[0]))
-    gradient = jax.grad(lambda critic: jnp.mean((q(critic, seen, action) - drawn[:, None]) ** 2))(state.critic)
-    # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
-    for before, now, target, g in zip(
-        *map(jax.tree.leaves, (state.critic, after.critic, after.target, gradient)), strict=True
-    ):
-        clear = np.abs(g) > 1e-5
-        np.testing.assert_allclose((now - before)[clear], (-3e-4 * np.sign(g))[clear], rtol=2e-3)
-        np.testing.assert_allclose(target, 0.75 * before + 0.25 * now, rtol=1e-5, atol=1e-7)
+    assert distance < 0.4  # of the squared distance that standing still leaves
 
 
 SMALL = {
@@ -189,13 +110,10 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     run = folder / "ES" / "seed0"
     training = json.loads((run / "training.json").read_text())
     assert [point["episodes"] for point in training["curve"]] == [0, 24, 40]  # 8 an update; after a half and the whole
-    rows = list(csv.DictReader((folder / "curves.csv").open()))
-    assert [float(row["return_rate"]) for row in rows] == [point["return_rate"] for point in training["curve"]]
     report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
     assert report["simulation"]["by_seed"]["0"] == report["simulation"]["return_rate"]
     assert report["simulation"]["mean_return"] != report["reality"]["mean_return"]  # only spin differs between the two
-    assert 0 < report["restlessness"]["action_change"] < 4
-    for name in ("curves.png", "transfer.png", "restlessness.png", "comparison.html"):
+    for name in ("curves.png", "comparison.html"):
         assert (folder / name).stat().st_size > 0
 
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
@@ -209,16 +127,15 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     assert missing() == {"ES": []}
     assert missing("seeds=[0, 3]") == {"ES": [3]}
     assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
-    assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
     assert missing("algorithms.ES.balls=narrow", "seeds=[3]") == {"ES": [3]}
     with pytest.raises(RunError, match="ES/seed0.*other settings of model;"):
         missing("algorithms.ES.model={sensing: {ball_noise: 0}}")
-    for override in ("budget.episodes=80", "algorithms.ES.optimiser.num_directions=3", "experiment.balls=narrow"):
-        with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|algorithm|balls);"):
+    for override in ("budget.episodes=80", "reality.ball_spin.mean_x=100.0", "experiment.balls=narrow"):
+        with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|reality|balls);"):
             missing(override)
 
 
-@pytest.mark.parametrize("settings", [{"kind": "ppo"}, {"kind": "sac"}, {"kind": "qt_opt"}, {"kind": "bgs"}])
+@pytest.mark.parametrize("settings", [{"kind": "ppo"}, {"kind": "bgs"}])
 def test_every_algorithm_has_the_joints_of_the_robot(tmp_path, settings):
     """Traced, not compiled: shapes of states, transitions and actions."""
     path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
@@ -231,45 +148,17 @@ def test_every_algorithm_has_the_joints_of_the_robot(tmp_path, settings):
     assert action.shape == (7, 5) and controller.mean.shape == (10,)
 
 
-def test_learning_keeps_its_shapes_on_another_robot(tmp_path):
-    """Traced, not compiled: play as all learners from steps do it, and QT-Opt's learning."""
-    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
-    comparison, config = baselines.load(path, ("algorithms.X={kind: qt_opt}",))
-    common = compare.prepare(comparison, config, str(path), tmp_path, Console())
-    learner = compare.learner(common.comparison.algorithms["X"], common.experiment)
-    state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
-    assert state.env.obs.shape == (64, 8 * 10)
-    after = jax.eval_shape(learner._piece, jax.eval_shape(learner._fill, state))
-    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
-    assert after.env.metrics.keys() == {"hit", "returned", "episode_return"}
-
-
-@pytest.mark.slow
-def test_a_comparison_on_another_robot_runs(tmp_path):
-    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
-    folder = compare.compare(*baselines.load(path), str(path), tmp_path, Console())
-    report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
-    assert np.isfinite(report["simulation"]["mean_return"])
-    assert compare.unfinished(compare.prepare(*baselines.load(path), str(path), tmp_path, Console())) == {"ES": []}
-    with pytest.raises(RunError, match="ES/seed0.*other settings of robot"):
-        compare.unfinished(
-            compare.prepare(*baselines.load(path, ("robot=ur10e_rail",)), str(path), tmp_path, Console())
-        )
-
-
 @pytest.mark.parametrize(
     "override, message",
     [
         ("algorithms.X={kind: pp}", r"algorithms\.X\.kind.*pp"),
         ("algorithms.X={kind: ppo, minibatches: 7}", r"algorithms\.X: .*minibatches 7 .*1024"),
-        ("algorithms.X={kind: qt_opt, elites: 40}", r"algorithms\.X: .*elites 40 .*32"),
         (
             "algorithms.X={kind: ppo, minibatch: 7}",
             r"algorithms\.X\.minibatch: expected .*; did you mean 'minibatches'",
         ),
         ("algorithms.a/b={kind: ppo}", r"algorithms\.a/b"),
         ("budget={clock: cpu}", r"minutes, episodes or both"),
-        ("algorithms.X={kind: sac, first_entropy_weight: 0.1}", r"algorithms\.X: .*no key any more.*reward_scale"),
         ("seeds=[1, 1]", r"seeds.*different"),
         ("experiment.training.later_rewards={after: 0.5, rewards: real}", r"later_rewards"),
         ("experiment.initial_policy=runs/quickstart", r"experiment: initial_policy: .*runs/quickstart.*random weights"),
@@ -348,12 +237,3 @@ def test_a_site_trains_the_same(tmp_path):
     curves = [json.loads((folder / "training.json").read_text())["curve"] for folder in (alone, site)]
     timeless = [[p | {"seconds": 0, "cpu_seconds": 0} for p in curve] for curve in curves]
     assert timeless[0] == timeless[1]
-
-
-def test_trainings_at_a_time():
-    parsed = baselines.Comparison.model_validate(SMALL | {"seeds": [0, 1, 2]})
-    if jax.default_backend() == "cpu":
-        assert compare.choose(parsed, None) == min(3, len(os.sched_getaffinity(0)))
-    assert compare.choose(parsed, 2) == 2 and compare.choose(parsed, 9) == 3
-    timed = parsed.model_copy(update={"budget": baselines.Budget(minutes=1.0)})
-    assert compare.choose(timed, None) == 1

@@ -68,8 +68,9 @@ def identified(folder, served, late: float):
     logs = [served, *(folder / "hits" / file for file in ROBOT_FILES)]
     believed, before = ModelFile(SimModel()), identification.read_prior(PRIOR, "prior")
     made = identification.identify(logs, 400, believed, before, [folder / "hits"])
-    assert 0.6 * hit < made.hits <= hit + 1  # of balls that were hit nearly all are used, and no others
-    return {row["parameter"]: row for row in list_estimates(made.world) if row["decided by"] == LOGS}
+    # Of balls that were hit nearly all are used, and no others.
+    assert 0.6 * hit < made.provenance["identified"]["hits"] <= hit + 1
+    return {row["parameter"]: row for row in list_estimates(made) if row["decided by"] == LOGS}
 
 
 @pytest.mark.slow
@@ -95,8 +96,8 @@ def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path
 def test_without_a_log_of_the_joints_the_drives_are_drawn_from_the_prior(served):
     before = identification.read_prior(PRIOR, "prior")
     made = identification.identify([served], 60, ModelFile(SimModel()), before)
-    rows = {row["parameter"]: row for row in list_estimates(made.world)}
-    assert made.left == {} and rows["drives.joint_2.lag"]["decided by"] == "prior"
+    rows = {row["parameter"]: row for row in list_estimates(made)}
+    assert made.provenance["identified"]["joints"] == {} and rows["drives.joint_2.lag"]["decided by"] == "prior"
     for path in ("drives.joint_2.lag", "latency.abb_action", "latency.abb_observation"):
         assert [rows[path]["low"], rows[path]["high"]] == PRIOR[path]
     assert rows["ball.table.restitution"]["decided by"] == LOGS

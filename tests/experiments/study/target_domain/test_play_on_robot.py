@@ -1,15 +1,11 @@
-"""Rallies of a virtual player on the emulated robot that count in a study, on a machine that is late."""
+"""A study's play on the emulated robot: rallies over several sessions, and the choice among seeds."""
 
 from __future__ import annotations
 
 import io
 import json
-import multiprocessing
-import os
 import shutil
-import signal
-import threading
-import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,58 +14,19 @@ from rich.console import Console
 
 from experiments.deploy import play
 from experiments.errors import RunError
+from experiments.finetuning import loop
+from experiments.runs import load_policy
+from experiments.runs.run_dir import Run
 from experiments.study.analysis import scoring
-from experiments.study.target_domain import evaluation_on_robot
-from experiments.study.target_domain.evaluation_on_robot import PLAYED, derive_seed, make_rally_step
+from experiments.study.target_domain import play_on_robot
+from experiments.study.target_domain.play_on_robot import derive_seed, make_rally_step
+from experiments.training import sweep
+from experiments.training.sweep import Job
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from tests.support.paths import ROOT
 
 POLICY = ROOT / "experiments/shipped/policies/quickstart"
-RALLIES = 5  # that count
-BEFORE = 2  # rallies before the machine is late, whether they count or not
-STOPPED, PERIOD = 0.15, 0.5  # [s] the arm's controller stands still; often enough that no recovery is left in peace
-
-
-def late_until_a_session_has_ended(folder, said: io.StringIO, over: threading.Event) -> None:
-    """Stop the process of the arm again and again after a few rallies, until the first session's report is there."""
-    while said.getvalue().count("rally ") < BEFORE and not over.is_set():
-        time.sleep(0.05)
-    while not list(folder.glob("2*.json")) and not over.is_set():
-        for process in multiprocessing.active_children():
-            if process.name == "rig-arm":
-                os.kill(process.pid, signal.SIGSTOP)
-                time.sleep(STOPPED)
-                os.kill(process.pid, signal.SIGCONT)
-        time.sleep(PERIOD - STOPPED)
-
-
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tmp_path):
-    """The real rig, its controller's process stopped until it is not brought back after a fault."""
-    run, folder, said, over = tmp_path / "run", tmp_path / "rallies", io.StringIO(), threading.Event()
-    shutil.copytree(POLICY, run)
-    folder.mkdir()
-    step = make_rally_step(
-        folder, (0, "player3", "player3", "zero_shot"), lambda: run, (), RALLIES, Console(file=said, width=200)
-    )
-    disturbing = threading.Thread(target=late_until_a_session_has_ended, args=(folder, said, over))
-    disturbing.start()
-    try:
-        step.run()
-    finally:
-        over.set()
-        disturbing.join()
-    reports = [json.loads(path.read_text()) for path in sorted(folder.glob("2*.json"))]
-    played = [rally for report in reports for rally in report["rallies"]["list"]]
-    count = [sum(not rally["filtered"] for rally in report["rallies"]["list"]) for report in reports]
-    assert len(reports) >= 2 and len(reports[0]["rallies"]["list"]) >= BEFORE, said.getvalue()
-    assert count[0] < RALLIES and sum(count) == RALLIES, (count, said.getvalue())
-    assert reports[0]["faults"] and f"{RALLIES - count[0]} of {RALLIES} rallies are left" in said.getvalue()
-    counted = scoring.read(step.outputs[0])
-    np.testing.assert_array_equal(counted.length, [rally["length"] for rally in played])
-    np.testing.assert_array_equal(counted.filtered, [rally["filtered"] for rally in played])
 
 
 class Sessions:
@@ -113,14 +70,14 @@ def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
     monkeypatch.setattr(play, "run", rig.run)
-    monkeypatch.setattr(evaluation_on_robot, "export_once", lambda trained, console: run)
+    monkeypatch.setattr(play_on_robot, "export_once", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
     return make_rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
 
 
 def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
     step, rig = step_of(run, monkeypatch, [(3, 1), (2, 1), (2, 1), (5, 0)])
-    with pytest.raises(RunError, match="3 are missing.*goes on with these rallies"):
+    with pytest.raises(RunError, match="3 are missing.*goes on with those that were played"):
         step.run()
     assert rig.asked == [10, 7, 5]
     step.run()
@@ -140,7 +97,7 @@ def test_a_session_that_is_stopped_or_raises_counts_if_it_has_a_report(run, monk
         rig.plan = [(10, 0)]
     step.run()
     assert rig.asked == [10, 10 if end is None else 6]
-    assert rig.chances == [derive_seed(step.name), derive_seed(step.name) + 1]
+    assert rig.chances == [derive_seed(step.name), derive_seed(step.name) + (end is not None)]
     assert (~scoring.read(step.outputs[0]).filtered).sum() == 10
 
 
@@ -149,16 +106,36 @@ def test_a_policy_that_was_trained_anew_is_evaluated_anew(run, monkeypatch):
     with pytest.raises(RunError):
         step.run()
     folder = run.parent / "rallies"
-    for path in [folder / PLAYED, *folder.glob("2*[0-9].json")]:
+    for path in folder.glob("2*[0-9].json"):
         path.write_text(path.read_text().replace(artefacts.load(run).digest, "another"))
     step.run()
     assert rig.asked == [10, 6, 10]
 
 
-def test_an_evaluation_whose_table_is_gone_is_written_again_without_play(run, monkeypatch):
-    step, rig = step_of(run, monkeypatch, [(10, 0)])
-    step.run()
-    written = step.outputs[0].read_bytes()
-    step.outputs[0].unlink()
-    step.run()
-    assert step.outputs[0].read_bytes() == written and len(rig.asked) == 1
+BALLS = 3  # by which a test chooses
+
+
+def score(trained, robot, balls, seed, console) -> float:
+    assert robot == "lockstep" and balls == 50  # the paper's number, of which a test plays fewer
+    return play_on_robot.score(trained, robot, BALLS, seed, console)
+
+
+@pytest.mark.slow
+def test_the_seed_that_plays_best_on_the_emulated_robot_is_chosen(tmp_path, monkeypatch):
+    """The shipped policy against the same with its commands turned round; by hand from the robot's own words."""
+    monkeypatch.setattr(loop, "LOCK_STEP_BALLS", 64)
+    good = load_policy.load(POLICY)
+    bad = replace(good, policy=replace(good.policy, theta=-good.policy.theta))
+    robot = loop.lock_step_robot(loop.experiment_of(POLICY), seed=good.config.evaluation.seed + 1)
+    worth = []
+    for trained in (good, bad):
+        played = [robot.play(trained.policy.astype(np.float32), n).summary for n in range(BALLS)]
+        points = {"missed": 0, "hit": 1, "returned": 2}
+        worth.append(sum(-2 if one.fault else points[one.outcome] for one in played) / BALLS)
+    assert worth[0] > worth[1]
+    assert play_on_robot.score(bad, "lockstep", BALLS, good.config.evaluation.seed + 1, Console()) == worth[1]
+    jobs = [Job(good.config, Run(tmp_path / "seed0"), "test")]
+    shutil.copytree(POLICY, jobs[0].run.folder)
+    sweep.select(tmp_path, jobs, Console(file=io.StringIO()), "lockstep", score)
+    selection = json.loads((tmp_path / "selection.json").read_text())
+    assert selection["robot"] == "lockstep" and selection["scores"] == {"seed0": worth[0]}
