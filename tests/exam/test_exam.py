@@ -10,15 +10,13 @@ import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
-from tests.exam import baselines, examination
+from tests.exam import examination
 from tests.exam.generator import cases, held_out, human_strokes, robot, scoring
 from tests.exam.generator.cases import EFFECTS, Case
 from tests.exam.generator.invented_defects import INVENTED
@@ -104,13 +102,6 @@ def test_flight_and_bounce_agree_with_scipy():
     assert flight.bounce_time[0] == pytest.approx(contact, abs=1e-9)
     assert 0.2 < contact < 0.5
     np.testing.assert_allclose(flight.at(times[:, None])[..., 0], path, atol=1e-9)
-
-
-def test_a_sticking_bounce_stops_the_contact_point():
-    world = World(friction=5.0)
-    flight = fly(world, START[:, None], 0.7)
-    velocity, spin = flight.second[0, 3:6, 0], flight.second[0, 6:, 0]
-    np.testing.assert_allclose((velocity + np.cross(spin, [0, 0, -world.radius]))[:2], 0.0, atol=1e-12)
 
 
 def test_balls_are_independent_of_each_other():
@@ -323,57 +314,6 @@ def test_an_extended_model_is_read_by_its_paths(tmp_path):
     assert model.spin_mean.tolist() == [5, 0, 0] and model.spin_std.tolist() == [0, 2, 0]
 
 
-def test_baselines_find_a_plain_effect_in_plain_noise():
-    drawn = cases.build(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))
-    linear = baselines.linearise(drawn.log(), drawn.balls.human)
-    assert baselines.best_single(linear) == baselines.bic(linear) == ("wind_x",)
-    assert "wind_x" in baselines.lasso(linear) and "wind_x" in baselines.sindy(linear)
-    assert "wind_x" in baselines.sysid(linear)
-    drawn = cases.build(Case("none", (), 0.0, "iid", 3, count=60))
-    linear = baselines.linearise(drawn.log(), drawn.balls.human)
-    # Nothing but noise is left: 6 of about 186 directions of each ball are projected out.
-    assert linear.residual.std() == pytest.approx(SIGMA * math.sqrt(1 - 6 / 186), rel=0.02)
-    assert baselines.best_single(linear) == baselines.bic(linear) == ()
-
-
-def test_nonlinear_baselines_fly_what_the_columns_say():
-    drawn = cases.build(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))
-    linear, flights = baselines.both(drawn.log(), drawn.balls.human)
-    np.testing.assert_allclose(flights.residual(("wind_x",), np.zeros(1)), linear.residual, atol=1e-12)
-    little = 1e-4  # [m] of shift
-    moved = flights.residual(("wind_x",), np.array([little])) - linear.residual
-    column = -little * linear.columns[:, linear.names.index("wind_x")]
-    assert np.corrcoef(moved, column)[0, 1] > 0.999 and moved.std() == pytest.approx(column.std(), rel=0.02)
-
-
-def test_baselines_are_scored_as_the_diagnosis_is(monkeypatch):
-    monkeypatch.setattr(baselines, "NONLINEAR", {"nobody": lambda linear, flights: ()})
-    found = baselines.examine(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))["outcomes"]
-    assert found["best single"] == "right" and found["nobody"] == "missed"
-
-
-@pytest.mark.slow
-def test_nonlinear_baselines_find_a_plain_effect(monkeypatch):
-    monkeypatch.setattr(baselines, "ITERATIONS", 4)
-    monkeypatch.setattr(baselines, "NAMES", ("wind_x", "drag_coefficient", "table_height"))
-    drawn = cases.build(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))
-    linear, flights = baselines.both(drawn.log(), drawn.balls.human)
-    assert "wind_x" in baselines.mujoco(linear, flights)
-    monkeypatch.setattr(baselines, "EVALUATIONS", 120)
-    assert "wind_x" in baselines.cma_es(linear, flights)
-
-
-def test_lookalikes_look_alike():
-    drawn = cases.build(Case("none", (), 0.0, "iid", 1, count=60))
-    linear = baselines.linearise(drawn.log(), drawn.balls.human)
-    unit = linear.columns / np.linalg.norm(linear.columns, axis=0)
-    for pair in cases.LOOKALIKES:
-        a, b = (unit[:, linear.names.index(name)] for name in pair)
-        assert abs(a @ b) > 0.97, pair
-    a, b = (unit[:, linear.names.index(name)] for name in ("drag_coefficient", "wind_x"))
-    assert abs(a @ b) < 0.5
-
-
 def verdict(*groups, **rest):
     causes = [{"name": g[0], "group": list(g), "parameters": {}, "confidence": 0.9} for g in groups]
     return {"verdict": "named" if groups else "none", "causes": causes} | rest
@@ -408,20 +348,6 @@ def test_scoring_of_answers():
     assert outcome("single", ("wind_x",), verdict(("gravity_tilt_x",))) == "wrong"
     # A verdict that abstains names nothing, whatever it lists besides.
     assert outcome("single", ("wind_x",), verdict(("wind_y",)) | {"verdict": "undetermined"}) == "flagged"
-
-
-def test_reliability_counts_names_by_their_confidence(tmp_path):
-    def record(*confidences):
-        case = {"kind": "single", "causes": ["wind_x"], "size_mm": 10.0}
-        said = {"outcome": "right", "verdict": "named", "answer": "x", "twins": {}, "confidences": confidences}
-        return {"case": case, "seconds": 1.0} | said
-
-    records = [record([1.0, True])] * 9 + [record([0.9, True], [0.86, False]), record([1.0, False]), record()]
-    middle, sure = scoring.reliability(records)
-    assert (middle.confidence, middle.count, middle.true) == (pytest.approx(0.88), 2, 0.5)
-    assert (sure.count, sure.true) == (10, 0.9) and sure.low < 0.9 < sure.high
-    assert "| 1.000 | 10 | 0.900 |" in examination.summarise(records, {}, [], tmp_path)
-    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")
     truth = {"case": {"kind": "pair", "causes": ["wind_x", "magnus"]}, "twins": {}, "lookalikes": {}, "parameters": {}}
     scored = scoring.score(truth | {"spin": None}, verdict(("wind_x",), ("wind_y",)))
     assert scored["confidences"] == [[0.9, True], [0.9, False]]
@@ -435,12 +361,6 @@ def test_scoring_of_parameters():
     found = scoring.parameter_errors(truth, answer)
     assert found["ball.flight.wind_x"]["error"] == pytest.approx(0.05) and found["ball.flight.wind_x"]["covered"]
     assert found["ball.flight.mass"]["error"] == pytest.approx(1 / 3) and not found["ball.flight.mass"]["covered"]
-
-
-@pytest.mark.parametrize("hits, total", [(0, 10), (3, 10), (10, 10), (95, 100)])
-def test_clopper_pearson_is_scipys(hits, total):
-    wanted = binomtest(hits, total).proportion_ci(0.95, "exact")
-    np.testing.assert_allclose(scoring.clopper_pearson(hits, total), (wanted.low, wanted.high), atol=1e-9)
 
 
 def test_the_table_counts_against_the_bars():
@@ -467,12 +387,6 @@ def test_an_examination_goes_on_where_it_was(tmp_path):
     assert plan == examination.plan(["1", "2", "8"], 20, 0)
     assert {c.kind for c in plan[:8]} == {"none", "noise", "single", "invented"}  # the kinds take turns
     assert len({c.name for c in plan}) == len(plan) == 70
-    with pytest.raises(SystemExit):
-        examination.main(["--bars", "99", "--out", str(tmp_path)])
-    assert examination.by_itself(lambda: {"a": 1}) == {"a": 1}
-    assert "not there" in examination.by_itself(lambda: Path("/not there").read_text())["error"]
-    with pytest.raises(SystemExit):
-        examination.main(["--part", "3/2", "--out", str(tmp_path)])
 
 
 PEOPLE = pytest.mark.skipif(not human_strokes.DATA.exists(), reason=f"strokes are absent: {human_strokes.DATA}")
@@ -486,31 +400,16 @@ def test_people_play_as_they_were_measured():
     assert np.all(np.isfinite(flight.bounce_time)) and np.all(flight.bounce_state[1] < 0.0)
     median = np.median(np.linalg.norm(drawn.balls.start[6:], axis=0))
     assert 40.0 < median < 70.0, "of all strokes in the data it is 54 rad/s"
-    many = cases.draw("many", 20, 5)
-    assert {len(c.causes) for c in many} <= set(range(2, 9)) and all(len(set(c.causes)) == len(c.causes) for c in many)
-    assert all("magnus" not in c.causes for c in cases.draw("human_single", 40, 1, 10.0))
-
-
-def test_bounces_far_off_stay_in_their_ranges():
-    worlds = [cases.build(case).world for case in cases.draw("bounce", 40, 5)]
-    restitution, friction = (np.array([getattr(w, name) for w in worlds]) for name in ("restitution", "friction"))
-    assert 0.75 <= restitution.min() < 0.78 and 0.88 < restitution.max() <= 0.91
-    assert 0.08 <= friction.min() < 0.13 and 0.37 < friction.max() <= 0.42 and np.all(abs(friction - 0.25) >= 0.03)
 
 
 # --- a small examination, fixed in time: the command line answers, then the seal is opened ----------------------------
 
 
 SLOW = pytest.mark.slow
-MORE = (SLOW,)
-PEOPLE = pytest.mark.skipif(
-    not human_strokes.DATA.exists(), reason=f"measured strokes are absent: {human_strokes.DATA}"
-)
 FIXED = [
     pytest.param(Case("none", (), 0.0, "ar1", 11, count=200), ("right",), marks=SLOW),
-    pytest.param(Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",), marks=MORE),
-    pytest.param(Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",), marks=SLOW),
-    pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=MORE),
+    pytest.param(Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),
     pytest.param(Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",), marks=SLOW),
     pytest.param(
         Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=100),
@@ -525,22 +424,17 @@ FIXED = [
     ),
     pytest.param(Case("human_none", (), 0.0, "ar1", 31, count=200), ("right",), marks=[SLOW, PEOPLE]),
     pytest.param(
-        Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=[*MORE, PEOPLE]
-    ),
-    pytest.param(Case("human_single", ("wind_z",), 20.0, "range", 33, count=200), ("right",), marks=[*MORE, PEOPLE]),
-    pytest.param(
         Case("human_pair", ("drag_coefficient", "table_tilt_x"), 20.0, "ar1", 34, count=200),
         ("right",),
         marks=[SLOW, PEOPLE],
     ),
     # It changes drag and lift alike: one cause, not two.
     pytest.param(Case("human_single", ("ball_mass",), 20.0, "iid", 35, count=200), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(Case("kalman", (), 0.0, "iid", 41, count=200), ("right",), marks=MORE),
     # What its filter leaves along a flight is no finding; a wind beside it still is.
-    pytest.param(Case("kalman", (), 0.0, "iid", 1792730053), ("right",), marks=MORE),
+    pytest.param(Case("kalman", (), 0.0, "iid", 1792730053), ("right",), marks=SLOW),
     pytest.param(Case("kalman", ("wind_x",), 10.0, "ar1", 9001), ("right",), marks=SLOW),
     # Balls that spin fast would explain more of what it did behind the bounce than a filter of the catalogue.
-    pytest.param(Case("kalman", (), 0.0, "causal", 1212613227), ("right",), marks=MORE),
+    pytest.param(Case("kalman", (), 0.0, "causal", 1212613227), ("right",), marks=SLOW),
     # Three causes that undo each other were named for a filter, each larger than the error on unseen balls.
     pytest.param(Case("kalman", (), 0.0, "causal", 424983216), ("right", "flagged"), marks=SLOW),
     # A filter blurs a bounce as balls would that spin a little, by a lift that no ball has.

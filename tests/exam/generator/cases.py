@@ -128,8 +128,8 @@ EFFECTS: dict[str, Effect] = {
     "latency_jitter": Effect("jitter", _plus, 0.005, _one("sensing.jitter"), (1,)),
     "tracker_smoothing": Effect("smoothing", _plus, 0.008, _one("sensing.smoothing"), (1,)),
 }
-# Pairs whose effects on a log, the balls' states projected out, have a cosine above 0.97: measured with the generator's
-# own physics (tests/exam/test_exam.py). One of a pair in place of the other is a twin as the data can tell it.
+# Pairs whose effects on a log, the balls' states projected out, have a cosine above 0.97, measured with the generator's
+# own physics. One of a pair in place of the other is a twin as the data can tell it.
 LOOKALIKES = (
     ("wind_x", "gravity_tilt_x"),
     ("wind_y", "gravity_tilt_y"),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import beta, binom
+from scipy.stats import binom, binomtest
 
 from tests.exam.generator.cases import EFFECTS
 
@@ -30,7 +30,7 @@ def score(truth: dict, verdict: dict) -> dict:
     given = verdict["causes"] if verdict["verdict"] == "named" else []
     named = [{c["name"], *c.get("group", ())} for c in given]
     answer = "+".join(sorted(c["name"] for c in verdict["causes"])) if named else verdict["verdict"]
-    record = {"verdict": verdict["verdict"], "answer": answer, "groups": [sorted(g) for g in named]}
+    record = {"verdict": verdict["verdict"], "answer": answer}
     accepted = {c: {c} for c in ((*causes, "tracker_filter") if kind == "kalman" else causes)}
     if "magnus" in accepted:  # spins, and a k that is not the nominal one: both are true
         accepted["magnus"].add("magnus_coefficient")
@@ -43,23 +43,18 @@ def score(truth: dict, verdict: dict) -> dict:
     record["confidences"] = [
         [c["confidence"], any(names & group for names in accepted.values())]
         for c, group in zip(given, named, strict=True)
-        if "confidence" in c  # a baseline's answer has none
     ]
     if record["outcome"] == "right" and kind in ("single", "pair", "triple", "gauge", "bounce"):
         record["twins_reported"] = all(
             any({c, *truth["twins"].get(c, ())} <= g for g in named) for c in causes if truth["twins"].get(c)
         )
-        record["kin_reported"] = all(any(c in g and len(g) > 1 for g in named) for c in causes)
         record["parameters"] = parameter_errors(truth, verdict)
-    if kind == "many":
-        record["parameters"] = parameter_errors(truth, verdict)
-    if kind == "robot" and record["outcome"] == "right":
+    if kind == "many" or (kind == "robot" and record["outcome"] == "right"):
         record["parameters"] = parameter_errors(truth, verdict)
     if kind in ("unexcited", "invisible"):
         declared = set(verdict.get("not_excited", ())) | set(verdict.get("not_identifiable", ()))
         flat = {name for entry in declared for name in _names(entry)}
         record["declared"] = all(c in flat for c in causes)
-    record["held_out_reported"] = verdict.get("held_out")
     return record
 
 
@@ -165,14 +160,12 @@ def reliability(records: list[dict]) -> list[Reliability]:
     return out
 
 
-def clopper_pearson(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact two-sided interval of a proportion; (0, 1) of no cases."""
+def clopper_pearson(hits: int, total: int) -> tuple[float, float]:
+    """Exact two-sided 95 % interval of a proportion; (0, 1) of no cases."""
     if total == 0:
         return 0.0, 1.0
-    tail = (1.0 - level) / 2
-    low = float(beta.ppf(tail, hits, total - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(1.0 - tail, hits + 1, total - hits)) if hits < total else 1.0
-    return low, high
+    interval = binomtest(hits, total).proportion_ci(0.95, "exact")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)

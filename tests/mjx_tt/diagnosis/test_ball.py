@@ -16,7 +16,6 @@ from mjx_tt import diagnosis
 from mjx_tt.diagnosis.ball import discrepancy, inclusion
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import first_fit
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.inclusion import Family, LinearModel
@@ -122,15 +121,6 @@ def test_an_unnamed_force_moves_a_flight_as_it_would():
     push = 1e-3 * np.exp(-(((y - 0.3) / 0.3) ** 2))
     ours = response(push, 0) + 2.0 * response(push, 2)
     assert np.abs(ours - moved).max() < 0.03 * np.abs(moved).max()
-
-
-def test_first_fit_finds_the_bounce_of_every_ball():
-    start = starts(80, seed=1)
-    start[6:] = 0.0
-    measured = flown(World(), start) + np.random.default_rng(2).normal(0.0, 0.003, (3, 56, 80))
-    fitted = first_fit(problem_of(measured))
-    assert np.abs(fitted[:3] - start[:3]).max() < 0.01
-    assert np.abs(fitted[3:6] - start[3:6]).max() < 0.08
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.7])
@@ -324,21 +314,6 @@ def test_a_cause_leads_where_a_tracker_ripples_beside_it():
     assert found.verdict.held_out.after < 0.5 * found.verdict.held_out.before
 
 
-@pytest.mark.slow
-def test_nothing_leads_where_air_blows_in_one_place():
-    start = starts(60, seed=5)
-    start[6:] = 0.0
-
-    def jet(position, velocity):
-        push = 4.0 * np.exp(-(((position[1] + 0.2) / 0.15) ** 2))
-        return np.stack([push, 0.0 * push, 0.7 * push])
-
-    measured = flown(World(field=jet), start, 70)
-    measured = measured + np.random.default_rng(6).normal(0.0, 0.0005, measured.shape)
-    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
-    assert found.verdict.verdict == "unexplained" and found.extended.model == SimModel()
-
-
 def launcher(session: str) -> Path:
     path = MEASURED / "aimy_launcher" / f"{session}.hdf5"
     if not path.exists():
@@ -374,19 +349,3 @@ def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin
     # Drag, lift, bounce and a spin per ball by least squares had 15.2 and 18.8 mm.
     assert scored.score("diagnosed", 0.3).rms[0] < 0.016 and scored.score("diagnosed", 0.5).rms[0] < 0.021
     assert all(0.8 < scored.score("diagnosed", h).inside <= 0.97 for h in (0.1, 0.3, 0.5))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("session", ["mn5008_topspin", "no_spin_robot_simple"])
-def test_the_answer_on_real_balls_does_not_hang_on_the_last_digit(session):
-    """A tenth of a micrometre, a ten-thousandth of the tracker's noise, changes neither names nor sizes."""
-    logs = diagnosis.load_logs([launcher(session)])
-    rng = np.random.default_rng(9)
-    moved = tuple(replace(t, position=t.position + rng.normal(0.0, 1e-7, t.position.shape)) for t in logs.balls)
-    answers = [diagnosis.diagnose(x).verdict for x in (logs, replace(logs, balls=moved))]
-    names = [[c.name for c in v.causes] for v in answers]
-    assert names[0] and names[0] == names[1] and answers[0].verdict == answers[1].verdict
-    for one, other in zip(answers[0].causes, answers[1].causes, strict=True):
-        for path, estimate in one.parameters.items():
-            wide = estimate.high - estimate.low
-            assert abs(other.parameters[path].estimate - estimate.estimate) < 0.1 * wide

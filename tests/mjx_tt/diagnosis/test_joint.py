@@ -259,12 +259,6 @@ def test_calls_disturbances_now_and_then_unexplained():
     assert findings.unexplained.size > 3.0  # mrad
 
 
-def test_calls_a_cause_left_out_of_the_catalogue_unexplained(singles):
-    record = singles[0][EFFECTS.index("velocity_limit")]
-    findings = diagnose(record, without=["joint_2.velocity_limit"])
-    assert findings.unexplained is not None and findings.causes == ()
-
-
 @cache
 def slow(seed=0, joint="joint_2", one_way=False, **truth):
     """A log of smooth, slow motion."""
@@ -289,12 +283,6 @@ def test_says_what_the_log_does_not_excite():
     assert findings.causes == () and len(findings.not_excited) == 9  # all but the offset
     limited = diagnose(slow(velocity_limit=0.45))  # above the largest command
     assert limited.causes == () and "joint_2.velocity_limit" in {u.name for u in limited.not_excited}
-
-
-def test_groups_what_one_steady_speed_cannot_separate():
-    (cause,) = diagnose(slow(one_way=True, velocity_gain=0.9)).causes
-    assert {"joint_2.velocity_gain", "joint_2.coulomb_friction"} <= set(cause.group)
-    assert cause.separating_measurement
 
 
 def test_an_offset_needs_the_home_position():

@@ -11,8 +11,7 @@ from sklearn.mixture import GaussianMixture
 
 from mjx_tt import SimModel
 from mjx_tt.diagnosis import diagnose, load_logs
-from mjx_tt.diagnosis.ball.flights import spin_prior
-from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, learned
 from tests.exam.generator.sessions import draw_balls, measure, with_spin
 from tests.exam.generator.world import World
 from tests.exam.generator.write import ball_csv
@@ -51,21 +50,6 @@ def test_a_distribution_is_learned_through_flights_that_show_little():
     found = learned(np.repeat(np.diag(sigma**-2)[None], n, axis=0), seen / sigma**2, most=1)
     assert np.all(np.abs(found.mean - mean) < 5 * np.hypot(std, sigma) / np.sqrt(n))
     np.testing.assert_allclose(found.std, std, rtol=0.2)
-
-
-def test_one_kind_of_spin_is_called_one():
-    rng = np.random.default_rng(2)
-    spin = rng.normal([40, 0, 0], [30, 20, 25], (300, 3))
-    assert learned(np.repeat(0.04 * np.eye(3)[None], 300, axis=0), 0.04 * spin).components == 1
-
-
-def test_the_prior_moves_with_its_mean():
-    prior = SpinPrior(np.ones(3), np.ones(3), np.zeros((3, 5)), np.repeat(np.eye(3)[None], 5, axis=0))
-    moved = prior.moved(np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(moved.mean, [2.0, 3.0, 4.0])
-    np.testing.assert_array_equal(moved.of_balls(5)[0][:, 4], [1.0, 2.0, 3.0])
-    assert moved.of_some(np.array([0, 2])).own_mean.shape == (3, 2)
-    assert spin_prior.MAGNUS_RANGE[0] > 0.0
 
 
 def _log(tmp_path, world, balls, rng):

@@ -114,18 +114,6 @@ def test_lift_of_lobs_that_hardly_spin_is_not_taken_for_larger(lift):
     assert abs(float(values["ball.table.restitution"]) - 0.92) < 0.003
 
 
-def test_a_ball_that_flies_unlike_the_others_is_left_out():
-    """One of 60 swings by 2 cm from side to side, as no effect and no spin does it."""
-    balls, said = thrown(np.zeros(60)), []
-    time = balls[3].time
-    swings = balls[3].position + np.array([[0.02], [0.0], [0.0]]) * np.sin(40.0 * time)
-    odd = [*balls[:3], Trajectory("day", "odd", time, swings), *balls[4:]]
-    found = of_balls.fit(odd, SimModel(), KNOWN, said.append)
-    assert "left out, for no ball flies like that: 1" in said
-    without = of_balls.fit([*balls[:3], *balls[4:]], SimModel(), KNOWN)
-    assert apart(found, without) < 2.0 * posterior.SETTLED
-
-
 def test_a_fit_that_did_not_settle_says_as_much_and_states_how_far_it_would_go_on(monkeypatch):
     """After one round, from other code's flights off a slower table: its own errors alone would exclude the truth."""
     settled = of_balls.fit(thrown(np.zeros(60), World(restitution=0.89)), SimModel(), KNOWN)

@@ -103,18 +103,3 @@ def test_a_hit_that_is_met_or_missed_within_a_difference_decides_nothing():
     assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
     columns[2] = 0.0  # shows nowhere
     assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
-
-
-def test_too_few_hits_leave_everything_open():
-    measured, path = fitted(TRUTH, 7)
-    found = balls.fit(measured, MODEL, FLIGHTS)
-    assert hits.fit(found, measured[:8], path, PRIOR) is None
-    assert hits.fit(found, measured, None, PRIOR) is None
-
-
-def test_a_prior_without_anything_that_flies_is_refused():
-    measured, _ = play(TRUTH, 7)
-    with pytest.raises(
-        ValueError, match="nothing that flights show is in the prior, which has ball.paddle.restitution"
-    ):
-        balls.fit(measured, MODEL, {"ball.paddle.restitution": (0.9, 0.05)})

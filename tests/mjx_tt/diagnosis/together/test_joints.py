@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -59,12 +57,6 @@ def test_lags_gains_and_the_delay_of_each_bus_are_found(alone):
         assert abs(value - truth[path]) < 4.0 * error + 1e-5, (path, value, truth[path], error)
         assert error < (0.001 if path.endswith(("lag", "action")) else 0.002)
     assert found.samples().values.min() >= 0.0
-
-
-def test_a_missing_joint_is_named():
-    with pytest.raises(ValueError, match="no record of gantry_x, joint_6; all joints are needed"):
-        some = [replace(r, joint=name) for name, r in zip(JOINT_NAMES[1:7], records(2.0, 1e-4)[0], strict=False)]
-        joints.fit(some, SimModel(), PRIOR)
 
 
 def test_what_is_not_in_the_model_shows_in_what_is_left(alone):
