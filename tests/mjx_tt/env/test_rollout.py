@@ -18,7 +18,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
-from robot_io.contract import N_OBSERVATION, unflatten
+from robot_io.contract import unflatten
 from tests.support import scripted_episodes
 
 R, P = 6, 4
@@ -148,16 +148,6 @@ def test_a_ball_that_is_not_finite_fails_its_episode_alone(run, result, theta, e
     assert int(found.observation_counts[1]) == result.observation_counts[1] - result.steps[3, 1]
 
 
-def test_repeats_are_sorted_by_arrival_and_balls_are_the_pools(episodes, pool):
-    starts = np.concatenate([pool.state.position, pool.state.velocity])
-    drawn = np.concatenate([episodes.ball.position, episodes.ball.velocity])
-    which = (starts[:, :, None, None] == drawn[:, None]).all(axis=0)  # (64, R, P)
-    assert (which.sum(axis=0) == 1).all()
-    arrival = np.asarray(pool.arrival)[which.argmax(axis=0)]
-    assert (np.diff(arrival, axis=0) >= 0).all() and np.ptp(arrival) > 0
-    assert len(np.unique(which.argmax(axis=0))) > R * P / 2
-
-
 def test_every_episode_draws_its_own_chance(episodes):
     assert episodes.latency.shape == (5, R, P)
     assert len(np.unique(episodes.latency)) == 5 * R * P
@@ -166,17 +156,6 @@ def test_every_episode_draws_its_own_chance(episodes):
     assert restitution.shape == (R, P) and len(np.unique(restitution)) == R * P
     assert 0.88 <= restitution.min() and restitution.max() <= 0.97
     assert np.shape(episodes.model.ball.net.restitution) == ()
-
-
-def test_spin_of_the_balls_changes_nothing_else_that_is_drawn(simulator, pool, episodes):
-    spinning = models.with_values(SimModel(), {"ball_spin.mean_x": 80.0, "ball_spin.std_y": 10.0})
-    drawn = jax.jit(lambda key: simulator.draw(key, pool, spinning, RANDOMISE, R, P))(jax.random.key(1))
-    spin = np.asarray(drawn.ball.spin)
-    np.testing.assert_array_equal(spin[[0, 2]], np.array([80.0, 0.0])[:, None, None] + np.zeros((2, R, P)))
-    assert len(np.unique(spin[1])) == R * P and 3 < spin[1].std() < 20
-    assert not np.asarray(episodes.ball.spin).any()
-    with_old_spin = replace(drawn, ball=replace(drawn.ball, spin=episodes.ball.spin), model=episodes.model)
-    jax.tree.map(np.testing.assert_array_equal, with_old_spin, episodes)
 
 
 def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
@@ -192,25 +171,3 @@ def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
         path for path in models.paths() if path.startswith("drives.")
     }
     assert kept == nominal | {"drives.joint_2.lag", "sensing.jitter"}
-
-
-def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episodes, result):
-    """The same episodes with one joint slowed down: the same balls and delays, another way to meet them."""
-    ranges = (*RANDOMISE, Range("drives.joint_1.lag", 0.05, 0.1))
-    slow = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), ranges, R, P))(jax.random.key(1))
-    np.testing.assert_array_equal(slow.ball.position, episodes.ball.position)
-    found = jax.jit(lambda theta, episodes: simulator.rollout(Policy(theta, MEAN, INVERSE_SCALE), episodes))(
-        theta, slow
-    )
-    assert np.asarray(found.finite).all()
-    assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
-
-
-def test_mistakes_are_named(simulator, theta, episodes):
-    with pytest.raises(ValueError, match="theta has 3 columns, the episodes 4"):
-        simulator.rollout(Policy(theta[:, :3], MEAN, INVERSE_SCALE), episodes)
-    with pytest.raises(ValueError, match="99 devices wanted, this process has 2"):
-        Simulator(TaskConfig(), devices=99)
-    two = Simulator(TaskConfig(), devices=2)
-    with pytest.raises(ValueError, match="3 perturbations cannot be split evenly over 2 devices"):
-        two.on_devices(lambda x: two.local(x), out_specs=jax.sharding.PartitionSpec())(jnp.zeros((N_OBSERVATION, 3)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,16 +117,6 @@ def test_a_loop_within_a_loop_and_a_map():
     np.testing.assert_allclose(jax.jit(lambda x: jax.lax.map(block, x))(x), wanted, rtol=1e-6)
 
 
-def test_an_argument_that_is_no_array_is_left_to_xla():
-    class Doubler:
-        def __call__(self, x):
-            return 2.0 * x
-
-    start = (jnp.ones(3, bool), jnp.ones(3))
-    done = while_any(lambda s: s[0], lambda t, s, lanes, twice: (s[0], twice(s[1])), start, (), Doubler(), limit=3)
-    np.testing.assert_array_equal(done[1], [8.0] * 3)
-
-
 @pytest.mark.parametrize(
     "state, columns, said",
     [
@@ -141,10 +129,3 @@ def test_an_argument_that_is_no_array_is_left_to_xla():
 def test_a_form_that_does_not_fit_is_named(state, columns, said):
     with pytest.raises(Unsupported, match=said):
         _by_lanes(lambda s: s[0], lambda t, s, lanes, columns: s, state, (), columns, 1)
-
-
-def test_a_loop_that_is_known_is_not_left_to_xla(caplog):
-    caplog.set_level(logging.INFO)
-    done = while_any(lambda s: s[0], lambda t, s, a, b: (s[0], s[1] + 1.0), (jnp.ones(3, bool), jnp.zeros(3)), limit=4)
-    np.testing.assert_array_equal(done[1], [4.0] * 3)
-    assert "left to XLA" not in caplog.text

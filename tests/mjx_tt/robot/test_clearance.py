@@ -176,10 +176,3 @@ def test_segment_box_distance_by_hand():
         ):
             found = segment_box_distance(TABLE, *(np.array(e, float)[:, None] for e in (p, q)))
             assert float(found[0]) == pytest.approx(wanted, abs=1e-4)
-
-
-def test_a_model_without_its_capsules_is_refused(model):
-    kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
-    some = [c for c in mjcf.capsules(model) if c.name != "col_wrist"]
-    with pytest.raises(ValueError, match=r"lacks the capsules \['col_wrist'\]; it has .*'col_base'"):
-        CapsuleClearance(kinematics, some, WATCHED)

@@ -16,7 +16,6 @@ from ballmodel.partial_params import without_nominal
 from mjx_tt.robot import mjcf
 from mjx_tt.sim import actuators, model
 from mjx_tt.sim.actuators import DriveParams, Drives, JointDrive
-from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import JOINT_NAMES, LIMITS, N_JOINTS
 from tests.support import scripted_episodes
 from tests.support.scripted_episodes import episodes, script, task
@@ -238,10 +237,3 @@ def test_drives_are_those_of_the_contracts_joints_and_nominal_ones_cost_nothing(
     assert len(jax.tree.leaves(only)) == 1
     wanted = np.where(np.array(JOINT_NAMES) == "joint_3", 0.02, 0.0)
     np.testing.assert_allclose(only.lag, np.repeat(wanted[:, None], 3, axis=1), rtol=1e-6)
-
-
-def test_a_range_of_a_drive_gives_the_model_drives():
-    drawn = model.draw(jax.random.key(0), SimModel(), (Range("drives.joint_2.lag", 0.01, 0.03),), (200,))
-    lag = np.asarray(drawn.drives.joint_2.lag)
-    assert lag.shape == (200,) and 0.01 <= lag.min() < 0.013 and 0.027 < lag.max() <= 0.03
-    assert drawn.drives.joint_1 == JointDrive()
