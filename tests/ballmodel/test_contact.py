@@ -20,7 +20,6 @@ from ballmodel.contact import (
     surface_gap,
     surface_impact,
 )
-from ballmodel.partial_params import without_nominal
 
 UP = np.array([0.0, 0.0, 1.0])
 R, M = c.BALL_RADIUS, c.BALL_MASS
@@ -165,10 +164,3 @@ def test_a_tilted_surface_has_the_slopes_and_the_distance_of_its_plane(slopes):
         assert float(elevation(surface, np.array([x, y, z]))) == pytest.approx(over, abs=1e-12)
         assert float(distance) == pytest.approx(over / np.sqrt(1 + a * a + b * b), abs=1e-12)
         np.testing.assert_allclose(np.array(gap), frame[2] * float(distance), atol=1e-12)
-
-
-def test_a_level_surface_is_left_as_it_is():
-    level = without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05))
-    assert level.tilt_x is None and level.tilt_y is None and surface_frame(level) is None
-    assert without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05, 0.0, 0.01)).tilt_y == 0.01
-    assert without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05, np.zeros(3))).tilt_x is not None  # may become anything

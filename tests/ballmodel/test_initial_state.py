@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from ballmodel import initial_state, registry
+from ballmodel import registry
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
@@ -94,17 +94,6 @@ def test_a_batch_of_different_lengths_equals_single_fits():
         np.testing.assert_allclose(together.covariance[..., i], alone.covariance[..., 0], rtol=1e-6)
 
 
-def test_a_gap_in_the_samples_does_not_change_the_flight():
-    trajectories, truth = balls(5, 50, 0.0, seed=3)
-    keep = np.r_[0:10, 30:50]
-    thinned = []
-    for t in trajectories:
-        fine = flight(truth[:, len(thinned)], t.time[keep])
-        thinned.append(Trajectory("", t.name, t.time[keep], fine))
-    result = fit_gauss_newton(thinned, FlightParams())
-    np.testing.assert_allclose(unknowns(result.state), truth, atol=1e-7)
-
-
 def test_known_spin_is_used():
     spin = np.array([70.0, -20.0, 30.0])
     trajectories, truth = balls(5, 40, 0.0, magnus=0.6, spin=spin)
@@ -127,27 +116,6 @@ def test_huber_loss_shrugs_off_stray_samples():
     errors = [np.abs(unknowns(r.state) - truth).max(axis=0) for r in (plain, robust)]
     assert np.all(errors[1] < 0.1 * errors[0])
     assert robust.converged.all()
-
-
-def test_same_shapes_compile_once():
-    for seed in (0, 1):
-        trajectories, _ = balls(7, 20, 0.001, seed=seed)
-        fit_gauss_newton(trajectories, FlightParams(drag_coefficient=0.4 + 0.1 * seed))
-        if seed == 0:
-            compiled = initial_state._levenberg_marquardt._cache_size()
-    assert initial_state._levenberg_marquardt._cache_size() == compiled
-    assert not jax.config.jax_enable_x64
-
-
-def test_refuses_what_cannot_be_fitted():
-    trajectories, _ = balls(3, 10, 0.0)
-    short = trajectories[1].part(0, 3)
-    with pytest.raises(ValueError, match="1 of 2 .* fewer than 4 samples .* trajectory s/1 with 3"):
-        fit_gauss_newton([trajectories[0], short], FlightParams())
-    with pytest.raises(ValueError, match=r"spin has shape \(3, 2\), \(3, 3\) is wanted"):
-        fit_gauss_newton(trajectories, FlightParams(), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="no trajectory"):
-        fit_gauss_newton([], FlightParams())
 
 
 @pytest.mark.slow
@@ -191,13 +159,3 @@ def test_launcher_balls_and_what_their_residuals_say():
             with_lift = fit_gauss_newton(flights, FlightParams(magnus_coefficient=0.6), spin)
             assert np.median(with_lift.rms) < 0.5 * rms[session]
     assert rms["no_spin_robot_simple"] < rms["mn5008_topspin"] < 0.03
-
-
-@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
-def test_measured_states_give_a_distribution_of_human_size():
-    distribution, report = fit_human(read(MEASURED / "deepmind_ball_states" / "rallies.json"), ball_params())
-    assert report.measured == 13088
-    assert sum(report.outcomes.values()) + report.elsewhere == 13088
-    # The paper's players never exceed 9 m/s; the outlier share must be small for minima and maxima to mean something.
-    assert -12.0 < distribution.velocity_min[1] < -6.0 and distribution.velocity_max[1] < 0.0
-    assert 0.0 < report.outliers.outlier.mean() < 0.05

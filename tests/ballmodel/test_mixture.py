@@ -72,8 +72,6 @@ def test_no_valid_ball_says_why():
     "old, new, message",
     [
         ("weight: 1.0", "weight: 0.7", "shares that sum to 1"),
-        ("weight: 1.0", "wieght: 1.0", r"components\[0\]\.wieght: expected .*; did you mean 'weight'"),
-        ("mean: [0, ", "mean: [", "means .k, 9."),
         ("covariance: [[1, ", "covariance: [[-1, ", "component 0: expected symmetry"),
     ],
 )

@@ -3,22 +3,10 @@
 from __future__ import annotations
 
 import io
-import re
 
-import pytest
 from rich.console import Console
 
-from experiments.progress import ProgressBar, print_stages
-
-
-def test_a_stage_says_what_and_how_long():
-    text = io.StringIO()
-    stage = print_stages(Console(file=text), "run")
-    with stage("compiling"):
-        assert text.getvalue() == "run: compiling ..."
-    with pytest.raises(ZeroDivisionError), stage("failing"):
-        raise ZeroDivisionError
-    assert re.fullmatch(r"run: compiling \.\.\. \d+\.\d s\nrun: failing \.\.\.\n", text.getvalue())
+from experiments.progress import ProgressBar
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then_and_at_the_end():

@@ -32,19 +32,3 @@ def said(*steps: Experiment) -> list[str]:
     console = Console(file=io.StringIO(), record=True, width=200)
     show(Diagnosis(verdict, ModelFile(SimModel()), None, None, None, None), console)
     return console.export_text().splitlines()[1:]
-
-
-def test_what_both_next_steps_tell_is_said_once():
-    """And each one's own in the fewest words; a step that tells nothing is named alone."""
-    shared = ("a from b", "a from c", "whether there is d")
-    fast = Experiment("fast balls", shared, 30.0)
-    slow = Experiment("slow balls", (*shared, "whether there is e", "whether there is f"), 20.0)
-    assert said(fast, slow) == [
-        "  next: fast balls",
-        "  next: slow balls also tells whether there is e or f",
-        "  each of these tells a from b or c and whether there is d",
-    ]
-    assert said(fast) == ["  next: fast balls tells a from b or c and whether there is d"]
-    sweep = Experiment("a sweep of joint_2", (), 0.0)
-    assert said(sweep, fast) == ["  next: a sweep of joint_2", *said(fast)]
-    assert said(sweep) == ["  next: a sweep of joint_2"] and said() == []

@@ -14,15 +14,12 @@ from rich.console import Console
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
-from experiments.deploy.commissioning import Commissioning, Jogger
-from experiments.errors import ConfigError
+from experiments.deploy.commissioning import Commissioning
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import log
-from robot_io.contract import Contract, JointLimits
 from robot_io.control import messages
 from robot_io.emulator.processes import Rig
-from tests.experiments.deploy.test_play_other_robots import exported
 
 FR3, UR10E = "fr3_pedestal", "ur10e_rail"
 REST = 0.4  # [s] over which a robot that stands does not move
@@ -232,34 +229,3 @@ def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
     running.connect_arm(True)
     if doubt == "axis":
         running.connect_axis(0, True)
-
-
-def test_keys_of_many_joints():
-    """A tenth joint has no digit of its own."""
-    names = tuple(f"j{i}" for i in range(10))
-    limits = JointLimits(*((-1.0,) * 10, *((1.0,) * 10,) * 3, (0.01,) * 10, (1.0,) * 10), joints=names)
-    contract = Contract("long", ("m",) * 3 + ("rad",) * 7, (0, 1, 2), limits)
-    jogger = Jogger(contract)
-    jogger.pressed("9")
-    assert jogger.pressed("n") is None and str(jogger) == "j9, 2 mrad a step"
-    assert jogger.pressed("+") == messages.Jog((0,) * 9 + (0.002,))
-    jogger.pressed("n")
-    assert str(jogger) == "j0, 1 mm a step" and jogger.pressed("-") == messages.Jog((-0.001,) + (0,) * 9)
-    assert "1..9" in commissioning.jog_keys(contract) and "n" in commissioning.jog_keys(contract)
-    fr3 = simulated.load_shipped(FR3).contract
-    assert "1..7" in commissioning.jog_keys(fr3) and Jogger(fr3).pressed("8") is None
-
-
-def test_a_policy_for_another_robot_and_a_file_of_other_points_are_refused(tmp_path):
-    policy = exported(tmp_path / "artefact", FR3)
-
-    def job(name):
-        return Commissioning(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, name)
-
-    with pytest.raises(ConfigError, match="a policy for another robot than ur10e_rail as it is now"):
-        job(UR10E).check(Console(), policy)
-    with pytest.raises(ConfigError, match="nowhere: no robot; allowed: a folder"):
-        job("nowhere").jog(Console())
-    (tmp_path / "robot.yaml").write_text("axes: [{}, {}]\n")
-    with pytest.raises(ConfigError, match="robot.yaml: axes: expected 1 entries for ur10e_rail, .*rail, got 2"):
-        job(UR10E).jog(Console())

@@ -25,13 +25,13 @@ from rich.console import Console
 from ballmodel.distribution import load_distribution
 from bgs import strategy
 from experiments import cli
-from experiments.config import build, finetuning
+from experiments.config import build
 from experiments.config import experiment as config
 from experiments.config.finetuning import FineTuning
-from experiments.errors import ConfigError, RunError
+from experiments.errors import RunError
 from experiments.finetuning import loop
 from experiments.finetuning import report as finetune_report
-from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
+from experiments.finetuning.journal import BEFORE, TRAINING, Entry, Journal
 from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
@@ -116,48 +116,6 @@ def last_theta(folder: Path) -> np.ndarray:
 
 
 # Settings and rewards
-
-
-def test_the_defaults_are_the_papers_real_settings():
-    chosen = finetuning.load()
-    assert (chosen.step.learning_rate, chosen.sigma, chosen.num_directions, chosen.repeats, chosen.elite_fraction) == (
-        0.00375,
-        0.025,
-        5,
-        3,
-        0.6,
-    )
-    assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
-    assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
-    weights = {term.name: term.weight for term in build.reward_terms(chosen.rewards)}
-    assert {name: weight for name, weight in weights.items() if weight} == {
-        "state_transition": 1.0,
-        "net_clearance": 1.0,
-        "hit_and_land": 0.1,
-        "fault": 1.0,
-    }
-
-
-def test_settings_come_from_file_then_command_line(tmp_path):
-    path = tmp_path / "tuning.yaml"
-    path.write_text("updates: 12\nnum_directions: 7\n")
-    chosen = finetuning.load(path, ("num_directions=9", "step.learning_rate=0.001"))
-    assert (chosen.updates, chosen.num_directions, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
-
-
-@pytest.mark.parametrize(
-    "data, named",
-    [
-        ({"repeat": 5}, "repeats"),
-        ({"pairs": 5}, "pairs: expected .*; it is now called num_directions"),
-        ({"elite_fraction": 0.0}, "elite_fraction"),
-        ({"rewards": "sim"}, "real"),
-        ({"rewards": {"base": "real", "jerk": 0.3}}, "jerk"),
-    ],
-)
-def test_a_mistake_in_the_settings_is_named(data, named):
-    with pytest.raises(ConfigError, match=named):
-        finetuning.parse(data, "tuning.yaml")
 
 
 def test_reward_terms_of_a_real_episode():
@@ -358,7 +316,7 @@ class Failing(Toy):
         return super().play(*arguments)
 
 
-@pytest.mark.parametrize("after", [0, 3, 4, 9, 10, 15, 16, 25])
+@pytest.mark.parametrize("after", [0, 4, 9, 16])
 def test_no_more_than_the_episode_in_play_is_lost(source, tmp_path, after):
     tune(source, tmp_path / "whole", Toy())
     with pytest.raises(Interrupted):
@@ -537,13 +495,6 @@ def test_stop_and_continue_and_pause(source, tmp_path):
     np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
 
 
-def test_fewer_updates_than_planned_are_an_end_too(source, tmp_path):
-    assert tune(source, tmp_path / "run", Toy(), Person(stop_after=4 + 12)) is None
-    report = tune(source, tmp_path / "run", Toy(), updates=1)
-    assert report["updates"] == 1 and report["after"]["balls"] == 4
-    assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["updates"] == 1
-
-
 # Measurements
 
 
@@ -572,9 +523,3 @@ def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
     found = load_distribution(tmp_path / "anna.yaml")
     np.testing.assert_allclose(found.velocity_max[1], thrown.velocity[1].max(), atol=0.25)
     np.testing.assert_allclose(found.velocity_min[1], thrown.velocity[1].min(), atol=0.25)
-
-
-def test_phases_are_told_apart(source, tmp_path):
-    tune(source, tmp_path / "run", Toy())
-    phases = [entry.phase for entry in entries(tmp_path / "run")]
-    assert phases == [BEFORE] * 4 + [TRAINING] * 36 + [AFTER] * 4

@@ -62,13 +62,6 @@ def test_two_devices_learn_what_one_learns(updated):
     assert metrics_of_two == pytest.approx(metrics, rel=1e-3, abs=1e-6)
 
 
-def test_an_update_repeats_bit_for_bit(updated, trainers):
-    before, after, _ = updated[1]
-    again, _ = trainers[1].update(before)
-    np.testing.assert_array_equal(again.bgs.theta, after.bgs.theta)
-    np.testing.assert_array_equal(again.statistics.mean, after.statistics.mean)
-
-
 def test_an_update_climbs_the_clipped_gradient_and_averages(updated):
     before, after, metrics = updated[1]
     change = np.asarray(after.bgs.theta - before.bgs.theta)

@@ -68,20 +68,6 @@ def test_from_a_recording_to_its_figures(tmp_path, capsys):
     assert len(list((tmp_path / "pictures").rglob("*.png"))) == 2
 
 
-def test_requests_that_cannot_be_met_are_refused(tmp_path, capsys):
-    (tmp_path / "a.csv").write_text("frame,x,y\n0,1,2\n")
-    refused = {
-        ("evaluate", str(tmp_path / "a.csv")): "--labels",
-        ("evaluate", "--detector", str(tmp_path)): "mjx-tt vision train",
-        ("record", "--out", str(tmp_path / "a.mp4")): ".mcap",
-        ("label", "nowhere.mp4", "--out", str(tmp_path / "b.csv")): "no such file",
-        ("evaluate", str(tmp_path / "a.csv"), "--labels", str(tmp_path / "a.csv")): "expected a video file",
-    }
-    for arguments, message in refused.items():
-        assert cli.main(["vision", *arguments]) == 1
-        assert message in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_training_from_nothing_gives_a_detector_and_resumes(tmp_path):
     plan = pipeline.Plan(20, 300, 120, 80, 120, 20, 120, 2, 1, 20, 1)
