@@ -27,7 +27,7 @@ from mjx_tt.diagnosis.logs import Logs
 from mjx_tt.diagnosis.report import figures, residuals
 from mjx_tt.diagnosis.report import page as report
 from mjx_tt.diagnosis.report import text as words
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
+from mjx_tt.diagnosis.verdict import Unexplained
 from mjx_tt.sim import model
 from tests.support.paths import ROOT
 
@@ -169,18 +169,6 @@ def test_sentence_names_the_cause_with_its_direction_and_size(windy, windy_page)
     assert "ball.flight.wind_x" in page.sections["Parameters"]
 
 
-def test_residual_picture_shows_the_wind_before_and_nothing_after(windy):
-    """A ball that side wind blows runs ahead of its fitted parabola at both ends."""
-    found = windy.balls
-    before, after = residuals.residuals(found)
-    time, origin = residuals.flight_time(found)
-    assert origin == "bounce"
-    x = residuals.curve(found.problem.grid.time, before[0], found.problem.grid.mask)
-    assert x.quantiles[2, 0] < -1.0 and x.quantiles[2, -1] < -1.0 and x.quantiles[2].max() > 0.5
-    assert np.abs(residuals.curve(time, after[0], found.problem.grid.mask).quantiles[2]).max() < 0.8
-    assert np.all(np.diff(x.quantiles, axis=0) >= 0.0)
-
-
 def test_curve_is_the_plain_quantile_of_each_bin():
     rng = np.random.default_rng(0)
     quantity, residual = rng.uniform(0.0, 1.0, 4000), rng.normal(size=4000)
@@ -283,31 +271,6 @@ def test_cost_in_play(windy_page, joints, tmp_path):
     assert "play.png" in [f.name for f in files]
     page, _ = written(tmp_path, joints, play=PLAY | {"retrained": None})
     assert "costs 22.0" in page.text and "brings" not in page.sections["What it costs in play"]
-
-
-@pytest.mark.parametrize(
-    "name, estimate, text",
-    [
-        (
-            "table_restitution",
-            Estimate(0.93, 0.8997, 0.8967, 0.9023, "1"),
-            "returns less speed than the model says, restitution 0.900 (0.897 to 0.902) instead of 0.93",
-        ),
-        ("table_height", Estimate(0.0, -0.0041, -0.0044, -0.0038, "m"), "lies 4.1 mm (3.8 to 4.4) lower"),
-        (
-            "gantry_x.velocity_limit",
-            Estimate(math.inf, 1.31, 1.30, 1.32, "m/s"),
-            "gantry_x gets no faster than 1.31 m/s (1.30 to 1.32) instead of no limit",
-        ),
-        (
-            "joint_3.joint_offset",
-            Estimate(0.0, -0.004, -0.0041, -0.0039, "rad"),
-            "joint_3 reads 4.0 mrad (3.9 to 4.1) too low",
-        ),
-    ],
-)
-def test_claims_in_plain_words(name, estimate, text):
-    assert text in words.claim(Cause(name, (name,), 1.0, {"a.parameter": estimate}, 10.0, ""))
 
 
 def test_every_name_of_the_catalogue_has_words():

@@ -47,19 +47,6 @@ def test_another_number_of_episodes_compiles_nothing(play, policy, played):
     np.testing.assert_array_equal(again.ball, played.ball)
 
 
-def test_padding_changes_no_episode(play, policy):
-    """An episode does not know how many others are played with it: the first balls of a longer stream, at the same
-    places of the same call, give the same returns."""
-    at_once = evaluator.ROWS * evaluator.COLUMNS
-    few, many = play(policy, at_once - 1, seed=5), play(policy, at_once, seed=5)
-    same = (few.ball[:, None] == many.ball[None]).all(axis=-1)
-    assert same.any(axis=1).all()  # the pool of the longer one begins with the shorter one's
-    at = same.argmax(axis=1)
-    before = at == np.arange(at_once - 1)  # in front of the ball that is only in the longer one
-    assert before.any()
-    np.testing.assert_array_equal(few.returns[before], many.returns[: at_once - 1][before])
-
-
 def test_a_policy_is_loaded_from_artefact_and_file(policy, tmp_path):
     export.write(tmp_path / "artefact", policy, {})
     policy.save(tmp_path / "policy.npz")

@@ -71,15 +71,6 @@ def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
         np.testing.assert_allclose([robot.step(o) for o in observations[..., b]], exact, rtol=0, atol=1e-12)
 
 
-def test_sees_exactly_the_last_eight_observations():
-    theta, mean, inverse_scale, observations = draw(x64=False, seed=3)
-    changed = observations.copy()
-    changed[2] += 1.0
-    before, after = (streamed(theta, mean, inverse_scale, o) for o in (observations, changed))
-    differs = (np.abs(before - after) > 1e-6).any(axis=(1, 2))
-    assert differs.tolist() == [2 <= t < 2 + HISTORY for t in range(TICKS)]
-
-
 @pytest.fixture
 def control_process():
     """Undoes what the compiled policy sets for the process that it runs in."""

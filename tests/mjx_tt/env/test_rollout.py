@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +15,6 @@ from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import unflatten
 from tests.support import scripted_episodes
@@ -116,13 +114,6 @@ def test_statistics_equal_numpys_over_everything_that_was_observed(result, playe
         )
 
 
-@pytest.mark.parametrize(
-    ("repeats", "columns", "rows"), [(15, 400, 1), (15, 40, 15), (10, 200, 2), (7, 200, 1), (7, 100, 7)]
-)
-def test_blocks_are_whole_rows_that_divide_the_repeats(simulator, repeats, columns, rows):
-    assert simulator._block_rows(repeats, columns) == rows
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf], ids=str)
 def test_a_column_that_is_not_finite_is_masked_and_counted_alone(run, result, theta, episodes, value):
     broken = theta.copy()
@@ -135,39 +126,3 @@ def test_a_column_that_is_not_finite_is_masked_and_counted_alone(run, result, th
     assert found.observation_counts[2] == 0 and not found.observation_sums[..., 2].any()
     np.testing.assert_array_equal(found.returns[:, good], result.returns[:, good])
     np.testing.assert_array_equal(found.observation_sums[..., good], result.observation_sums[..., good])
-
-
-def test_a_ball_that_is_not_finite_fails_its_episode_alone(run, result, theta, episodes):
-    position = np.array(episodes.ball.position)
-    position[1, 3, 1] = np.nan
-    found = run(theta, replace(episodes, ball=replace(episodes.ball, position=jnp.asarray(position))))
-    expected = np.ones((R, P), bool)
-    expected[3, 1] = False
-    np.testing.assert_array_equal(found.finite, expected)
-    np.testing.assert_array_equal(np.asarray(found.returns)[expected], result.returns[expected])
-    assert int(found.observation_counts[1]) == result.observation_counts[1] - result.steps[3, 1]
-
-
-def test_every_episode_draws_its_own_chance(episodes):
-    assert episodes.latency.shape == (5, R, P)
-    assert len(np.unique(episodes.latency)) == 5 * R * P
-    assert len(np.unique(episodes.seed)) == R * P
-    restitution = np.asarray(episodes.model.ball.table.restitution)
-    assert restitution.shape == (R, P) and len(np.unique(restitution)) == R * P
-    assert 0.88 <= restitution.min() and restitution.max() <= 0.97
-    assert np.shape(episodes.model.ball.net.restitution) == ()
-
-
-def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
-    """Only what departs from nominal, or may, costs anything in the loop."""
-    left_out = {path for path, value in models.paths(episodes.model).items() if value is None}
-    assert {"ball.table.tilt_x", "ball.paddle.offset", "sensing.jitter", "sensing.camera_scale"} <= left_out
-    assert episodes.model.drives is None
-    values = {"drives.joint_2.lag": 0.02, "drives.joint_3.lag": 0.0, "sensing.jitter": 1e-3}
-    some = models.with_values(SimModel(), values)
-    drawn = simulator.draw(jax.random.key(1), pool, some, (), R, P).model
-    kept = {path for path, value in models.paths(drawn).items() if value is not None}
-    nominal = {path for path, value in models.paths(episodes.model).items() if value is not None} - {
-        path for path in models.paths() if path.startswith("drives.")
-    }
-    assert kept == nominal | {"drives.joint_2.lag", "sensing.jitter"}

@@ -11,11 +11,10 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env.episode import MISSED, RETURNED, FixedAction, reshape_episodes
+from mjx_tt.env.episode import MISSED, RETURNED, reshape_episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import CONTRACT_OBSERVATIONS, Task, TaskConfig, weigh_rewards
-from mjx_tt.env.terms import ObservationTerm
+from mjx_tt.env.task import TaskConfig, weigh_rewards
 from mjx_tt.gradient import motion as motions
 from mjx_tt.gradient.incoming import fly_incoming
 from mjx_tt.gradient.network import differentiable
@@ -100,27 +99,6 @@ def test_its_observations_are_those_of_the_simulator(policy, pool):
     np.testing.assert_allclose(
         sum((row - np.asarray(policy.mean)).sum(0) for row in rows), np.asarray(sums), atol=0.02, rtol=1e-4
     )
-
-
-def test_further_observation_terms_are_those_of_the_simulator(pool):
-    """The command of the step before, while the robot moves under a constant action."""
-    term = ObservationTerm("last_command", lambda sensed: sensed.command, 0.5)
-    config = replace(CONFIG, sim_rate=75.0, observations=(*CONTRACT_OBSERVATIONS, term))
-    task, drawn = (
-        Task(config),
-        jax.tree.map(lambda x: x[..., :2] if x.ndim else x, reshape_episodes(episodes(pool), -1)),
-    )
-    controller = FixedAction(jnp.full((8, 2), 0.3), jnp.zeros(19))
-
-    def move(drawn):
-        constants = task.prepare(drawn)
-        ball = fly_incoming(task, drawn, constants, 4)
-        return motions.simulate_motion(task, motions.Servos(task), controller, drawn, constants, ball)
-
-    moved = jax.jit(move)(drawn)
-    assert moved.observations.shape == (4, 19, 2) and np.abs(moved.commands[0]).min() > 0.01
-    np.testing.assert_array_equal(moved.observations[0, 11:], 0.0)
-    np.testing.assert_allclose(moved.observations[1:, 11:], 0.5 * moved.commands[:-1], rtol=1e-6)
 
 
 def replace_columns(drawn, rows, column):

@@ -205,15 +205,3 @@ def test_sums_and_products_agree_to_rounding(function):
 def test_what_is_not_known_is_named(function, said):
     with pytest.raises(Unsupported, match=said):
         by_lanes(function, M)
-
-
-@pytest.mark.parametrize("x, said", [(2.0, "not among its arguments"), (np.ones(L, np.float32), "tracing with")])
-def test_an_array_that_the_step_closes_over_is_no_constant(x, said):
-    def run(x):
-        def step(tick, s, lanes, columns):
-            return s[0], s[1] + x
-
-        return _by_lanes(lambda s: s[0], step, (jnp.ones(L, bool), jnp.ones(L)), (), (), 1)
-
-    with pytest.raises(Unsupported, match=said):
-        jax.jit(run)(jnp.asarray(x))

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
@@ -120,13 +119,6 @@ def test_a_harder_ball_is_answered_worse(how):
     assert missed[1] >= missed[0]
 
 
-def test_what_cannot_be_reached_is_missed_and_left_as_it_was():
-    ball = incoming(x=2.5)
-    answer = answers("player1", ball)
-    assert not np.any(answer.hit)
-    np.testing.assert_array_equal(answer.ball.velocity, ball.ball.velocity)
-
-
 def test_unread_topspin_lifts_the_answer_and_the_robot_becomes_familiar():
     n = 4000
     spinning = incoming(spin=(-100.0, 0.0, 0.0), n=n)  # topspin of a ball that flies along +y
@@ -151,27 +143,3 @@ def test_tiring_and_getting_used_to_the_robot_follow_their_geometric_laws():
     )
     speed = float(jnp.linalg.norm(ball.ball.velocity[:, 0]))
     np.testing.assert_allclose(np.asarray(state.expected)[:, 0], [0.0, 0.7, speed], atol=0.02)
-
-
-def test_files_come_back_as_they_were(tmp_path):
-    player = human_player.load("player2")
-    path = tmp_path / "me.yaml"
-    path.write_text(yaml.safe_dump({"name": "me"} | human_player.to_dict(player)))
-    assert human_player.to_dict(human_player.read(path)) == human_player.to_dict(player)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: d["first"].update(x=[1.0, 0.0, 2.0]), r"first\.x: expected .* ascending order, got \[1.0, "),
-        (lambda d: d["ability"].update(rech=1.0), r"ability\.rech: expected .*; did you mean 'reach'\?"),
-    ],
-)
-def test_errors_name_file_and_key(tmp_path, change, message):
-    data = human_player.to_dict(human_player.load("player1"))
-    change(data)
-    path = tmp_path / "bad.yaml"
-    path.write_text(yaml.safe_dump(data))
-    with pytest.raises(ValueError, match=message) as error:
-        human_player.read(path)
-    assert str(path) in str(error.value)

@@ -47,15 +47,6 @@ def test_what_is_left_out_is_nominal(tmp_path):
     assert ModelFile.load(tmp_path / "empty.yaml").model == SimModel()
 
 
-def test_nominal_latencies_are_the_papers():
-    """Means and deviations in ms of the paper's table: ball, ABB and Festo observation, ABB and Festo action."""
-    nominal = LatencyParams()
-    means = [getattr(nominal, name) * 1e3 for name in LATENCIES]
-    deviations = [getattr(nominal, f"{name}_std") * 1e3 for name in LATENCIES]
-    np.testing.assert_allclose(means, [40, 29, 33, 71, 64.5])
-    np.testing.assert_allclose(deviations, [8.2, 8.2, 9.0, 5.7, 11.5])
-
-
 @pytest.mark.parametrize("mean", [0.0, 30.0], ids=str)
 def test_spin_is_gaussian_about_its_mean(mean):
     spin = BallSpinParams(mean_x=mean, mean_y=-5.0, std_x=20.0, std_z=2.0)

@@ -10,7 +10,6 @@ from PIL import Image
 
 from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.viz import rendering
-from mjx_tt.viz.caption import BACKGROUND, Caption
 from mjx_tt.viz.rendering import BRIGHT, Moment
 
 SIZE = (320, 180)
@@ -105,32 +104,3 @@ def test_video_has_its_frames_and_duration(tmp_path, home, name, fps, seconds):
         else:
             assert video.get_meta_data()["duration"] == pytest.approx(seconds, abs=0.01)
             assert video.get_meta_data()["size"] == SIZE
-
-
-def test_trail_and_dots_mark_the_way_of_the_ball(home):
-    """From the top: one line along the table as long as the path, and as many dots as there are places."""
-    path = np.linspace([0.3, 1.2, 0.3], [0.3, 0.2, 0.3], 10)
-    ahead = np.array([[0.3, y, 0.3] for y in (0.0, -0.3, -0.6)])
-    image = drawn(Moment(home, trail=path, dots=ahead), "top", (640, 360))
-    where = np.argwhere(near(image, BRIGHT, 90))
-    (_, first), scale = pixel(path[0], "top", (640, 360))
-    (_, last), _ = pixel(path[-1], "top", (640, 360))
-    line = where[where[:, 1] > last - 0.02 * scale]
-    assert np.ptp(line[:, 0]) <= 2 * rendering.TRAIL_RADIUS * scale
-    assert line[:, 1].max() == pytest.approx(first, abs=2.5)
-    for dot in ahead:
-        place, scale = pixel(dot, "top", (640, 360))
-        assert (np.hypot(*(where + 0.5 - place).T) < 0.012 * scale + 1).sum() >= 2
-
-
-def test_caption_lies_in_the_picture_and_leaves_the_scene(home):
-    plain = drawn(Moment(home), "human", (640, 360))
-    for text in ("returned, 5.5 m/s in, 6.1 m/s out", "long " * 40):
-        image = drawn(Moment(home, caption=Caption("Ball 1", text, "1/8 speed")), "human", (640, 360))
-        bar = (np.abs(image - np.array(BACKGROUND)) < 12).all(axis=-1)
-        top = int(np.argmax(bar[:, 0]))
-        assert (image[:top] == plain[:top]).all()
-        assert 0.9 < top / 360 < 0.94
-        assert bar[top:, :6].all()
-        assert bar[top:, -6:].all()  # the text ends before the edge
-        assert (~bar[top:]).mean() > 0.02  # it is there
