@@ -37,15 +37,6 @@ def test_a_product_of_matrices():
     assert operations.count(compiled).operations == 2 * 8 * 16 * 32
 
 
-def test_a_loop_of_unknown_length_is_refused():
-    def double(x):
-        return jax.lax.while_loop(lambda x: x.sum() < 100.0, lambda x: 2.0 * x, x)
-
-    compiled = jax.jit(double).lower(jnp.ones(4)).compile()
-    with pytest.raises(ValueError, match="does not say how often its loop .* runs"):
-        operations.count(compiled)
-
-
 def test_a_loop_by_lanes_by_hand():
     """Three rounds of a product and a sum, then one square root; two numbers in, one out."""
 

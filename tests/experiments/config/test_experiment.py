@@ -43,16 +43,6 @@ def test_shipped_experiments_load_and_fit_the_schema(path):
     build.experiment(loaded, str(path))
 
 
-def test_schema_refuses_what_the_program_refuses():
-    for data in (
-        with_value("trainin", {}),
-        with_value("task.engine", "fast"),
-        with_value("optimiser.elite_fraction", 0),
-    ):
-        with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate(data, config.json_schema())
-
-
 @pytest.mark.parametrize(
     "path, value, place, hint",
     [
@@ -85,18 +75,6 @@ def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
     assert hint in text
 
 
-@pytest.mark.parametrize(
-    "path, value",
-    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"mine": 1.0})],
-)
-def test_first_order_gradients_refuse_rewards_that_they_do_not_climb(path, value):
-    data = with_value(path, value)
-    data["optimiser"] = {"gradient": "first_order"}
-    text = complaint(data)
-    assert f"{path.replace('task.rewards', 'task.rewards.mine')}: optimiser.gradient first_order" in text
-    assert "leave it out, or take gradient: zeroth_order" in text
-
-
 def test_yaml_traps(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("name: a\nballs: narrow\noptimiser: {sigma: 25e-3}\n")
@@ -109,15 +87,6 @@ def test_yaml_traps(tmp_path):
         config.load(file)
     with pytest.raises(ConfigError, match="quickstart.yaml"):
         config.load(tmp_path / "quickstrt.yaml")
-
-
-def test_overrides(tmp_path):
-    file = tmp_path / "a.yaml"
-    file.write_text("name: a\nballs: narrow\n")
-    changed = config.load(file, ("training.updates=7", "balls=player1/M0", "optimiser.step.kind=sgd"))
-    assert (changed.training.updates, changed.balls, changed.optimiser.step.kind) == (7, "player1/M0", "sgd")
-    with pytest.raises(ConfigError, match="--set training.updates"):
-        config.load(file, ("training.updates",))
 
 
 def test_a_looked_up_experiment_stands_alone(tmp_path):
@@ -137,11 +106,6 @@ def test_a_looked_up_experiment_stands_alone(tmp_path):
     assert again.model == first.model
     assert again.model.model.sensing.ball_noise == 0.02
     assert again.config == first.config
-
-
-def test_an_older_artefacts_user_defined_weights_are_read():
-    older = config.Rewards(base="sim", style=1.0, jerk=None, own={"calm": 0.5})
-    assert older.to_dict() == {"base": "sim", "style": 1.0, "calm": 0.5}
 
 
 def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):

@@ -122,22 +122,6 @@ def test_every_field_mutated_is_refused_in_words_or_within_its_ceiling(kind):
     assert refused > 1000 and accepted > 50
 
 
-@pytest.mark.parametrize("kind", [RobotConfig, RigParams])
-def test_a_missing_key_is_its_default_and_a_missing_entry_is_refused(kind):
-    data = yaml.safe_load(robot.to_yaml(kind()))
-    for path in paths(data):
-        changed = copy.deepcopy(data)
-        owner = changed
-        for key in path[:-1]:
-            owner = owner[key]
-        del owner[path[-1]]
-        if isinstance(path[-1], int):
-            with pytest.raises(ConfigError, match="expected"):
-                robot.fill(kind, changed, "file.yaml")
-        else:
-            assert robot.fill(kind, changed, "file.yaml") == kind()
-
-
 @pytest.mark.parametrize(
     "value", [".nan", ".inf", "-.inf", "~", "1e6", "0x7fffffff", "2026-11-22", "!!set {a}", "1:30"]
 )

@@ -7,7 +7,6 @@ import os
 import pytest
 import yaml
 
-from experiments import cli
 from experiments.config import site
 from experiments.errors import ConfigError
 from experiments.jobs import engines
@@ -48,31 +47,6 @@ def test_a_mistake_is_named(tmp_path, data, message):
     with pytest.raises(ConfigError, match=message) as error:
         site.load(path)
     assert all("cluster.yaml" in line for line in str(error.value).splitlines())
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ("train quickstart.yaml --site nowhere.yaml", "--site nowhere.yaml: cannot be read: No such file or directory"),
-        ("train quickstart.yaml --site SITE --processes 2", "--processes 2: with --site"),
-        ("train quickstart.yaml --site SITE --distributed auto", "with --distributed each process is started by you"),
-        ("is2r ROBOT --site SITE", "with a robot the steps are done where it stands; allowed: local"),
-    ],
-)
-def test_a_command_refuses_what_does_not_go_with_a_site(tmp_path, arguments, message, capsys):
-    study = {
-        "name": "anna",
-        "players": ["player3"],
-        "robot": "lockstep",
-        "recordings": {"player3": "anna.csv"},
-        "ablation": None,
-        "simulation": {"rounds": [{"simulated": 1, "real": 1}] * 3},
-    }
-    (tmp_path / "anna.yaml").write_text(yaml.safe_dump(study))
-    places = {"SITE": str(write(tmp_path, SLURM)), "ROBOT": str(tmp_path / "anna.yaml")}
-    given = [places.get(part, part) for part in arguments.split()]
-    assert cli.main([*given, "--out", str(tmp_path / "runs")]) == 1
-    assert message in capsys.readouterr().err
 
 
 def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections import deque
 
-import mujoco
 import numpy as np
 import pytest
 from rich.console import Console
@@ -23,15 +21,6 @@ from robot_io.emulator.processes import Rig
 
 FR3, UR10E = "fr3_pedestal", "ur10e_rail"
 REST = 0.4  # [s] over which a robot that stands does not move
-
-
-def blade(robot, qpos):
-    """The blade's centre (3,) [m] by MuJoCo's own kinematics."""
-    model = robot.model()
-    data = mujoco.MjData(model)
-    data.qpos[: len(qpos)] = qpos
-    mujoco.mj_kinematics(model, data)
-    return data.site("paddle").xpos.copy()
 
 
 class Operator:
@@ -100,75 +89,6 @@ def switched_on(rig, operator):
         return operator.status.arm is None
 
     return running
-
-
-def at_rest(rig):
-    before = rig.state()[0]
-    time.sleep(REST)
-    return np.abs(rig.state()[0] - before).max() < 1e-3
-
-
-@pytest.mark.realtime
-def test_it_moves_armed_and_in_small_steps_only(rig, tmp_path, monkeypatch):
-    robot, running = rig
-    n, first, places = robot.contract.n_joints, running.state()[0], []
-    step = 0.02 if robot.contract.units[0] == "m" else 0.05
-    fastest = np.zeros(n)
-
-    def look(key):
-        def now():
-            places.append(running.state()[0])
-            return key
-
-        return now
-
-    def moved(check):
-        def there():
-            nonlocal fastest
-            fastest = np.maximum(fastest, np.abs(running.state()[1]))
-            return check(running.state()[0] - places[-1])
-
-        return there
-
-    stepped = lambda away: abs(away[0] - step) < 2e-3 and np.abs(away[1:]).max() < 2e-3  # noqa: E731
-    raised = lambda _: (  # noqa: E731
-        np.abs(blade(robot, running.state()[0]) - blade(robot, places[-1]) - [0, 0, 0.005]).max() < 2e-3
-    )
-    operator = Operator()
-    operator.steps.extend(
-        [
-            (operator.in_state("disarmed"), "1"),
-            (lambda: True, "+"),
-            (operator.heard("arm it first"), ""),
-            (switched_on(running, operator), "p"),
-            (lambda: not operator.status.missing, look("a")),
-            (operator.in_state("ready"), "s"),
-            (lambda: True, "s"),
-            (lambda: True, "+"),
-            (moved(stepped), "z"),
-            (lambda: at_rest(running), look("")),
-            (lambda: True, "s"),
-            (lambda: True, "s"),
-            (lambda: True, "+"),
-            (moved(raised), "x"),
-            (lambda: at_rest(running), "m"),
-            (lambda: time.sleep(1.1) or True, "m"),
-            (operator.heard("noted in"), look(" ")),
-            (operator.in_state("disarmed"), "q"),
-        ]
-    )
-    shown = jog(robot, running, operator, tmp_path, monkeypatch)
-    assert "answered" in shown and " 0 answered" not in shown
-    np.testing.assert_allclose(places[0], first, atol=2e-3)  # nothing moved before it was armed
-    pace = 0.03 * np.array(robot.contract.limits.policy_velocity)
-    assert (fastest < 1.5 * pace + 0.02).all() and (fastest > 0).all()
-    lines = list(csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8")))
-    noted = np.array([float(lines[-1][name]) for name in robot.contract.joints])
-    np.testing.assert_allclose(noted, places[-1], atol=2e-3)
-    session = log.read(next(tmp_path.glob("*-jog.mcap")))
-    assert session.robot == robot.contract
-    sent = np.abs(session.commands.sent).max(axis=1)
-    assert (sent <= pace * (1 + 1e-9)).all() and (sent > 0).any()
 
 
 @pytest.mark.realtime

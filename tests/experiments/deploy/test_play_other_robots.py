@@ -20,7 +20,6 @@ from experiments.deploy.control_session import ControlSession
 from experiments.errors import ConfigError
 from experiments.finetuning.robot import LockStepRobot
 from experiments.options import RIG, RobotOptions
-from experiments.sharing import recordings
 from experiments.view import measured
 from experiments.view.viewer import robot_of
 from mjx_tt.robot import robots as simulated
@@ -108,19 +107,6 @@ def test_its_session_is_diagnosed_with_the_robot_and_refused_without(played):
     assert [record.joint for record in found.joints] == list(robot.contract.joints)
     with pytest.raises(ValueError, match=f"a session of {robot.name}, whose joints .* allowed is {robot.name}"):
         diagnose.read_logs([str(path)])
-
-
-@pytest.mark.realtime
-def test_its_session_is_exported_with_its_joints(played):
-    robot, path, _ = played
-    recording = recordings.read([str(path)])
-    contract = robot.contract
-    assert recording.robot == f"{robot.name}, emulated"
-    assert recording.features["observation.state"].names == contract.observation_names
-    assert recording.features["sent"].names == contract.joints
-    for episode in recording.episodes:
-        assert episode.columns["observation.state"].shape[1] == contract.n_observation
-        assert episode.columns["action"].shape[1] == contract.n_joints
 
 
 def loosened(folder):

@@ -11,9 +11,8 @@ from PIL import Image
 
 from experiments.config import build
 from experiments.config import experiment as config
-from experiments.evaluation import evaluate, figures, learning_curves
+from experiments.evaluation import evaluate, figures
 from experiments.evaluation.evaluate import Played
-from experiments.evaluation.learning_curves import Curve
 from mjx_tt.env import reward_weights
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
@@ -121,39 +120,3 @@ def test_pictures_show_what_was_counted(tmp_path):
     assert green[0] > 10 * green[1]
     assert share(returned[1], "#006837") > 0.05  # the colour map's green end fills the robot's half
     assert share(missed[1], "#a50026") > 0.05  # and its red end
-
-
-def rising() -> list[dict]:
-    """Rows of metrics of 60 updates, some values missing."""
-    rows = [
-        {
-            "update": i + 1,
-            "seconds": 0.1 * i,
-            "return_rate": i / 60,
-            "hit_rate": None if i < 3 else 0.5,
-            "mean_return": None,
-        }
-        for i in range(60)
-    ]
-    rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}
-    return rows
-
-
-def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
-    """The figure's own lines against the rows: the second training plays ten times the balls in half the time."""
-    rows = rising()
-    faster = [row | {"seconds": row["seconds"] / 2} for row in rows]
-    figure = learning_curves._curves([Curve("one", rows, 100), Curve("two", faster, 1000)])
-    minutes, balls = ({line.get_label(): line.get_xydata() for line in axes.lines} for axes in figure.axes)
-    assert list(minutes) == ["one, perturbed", "one, evaluated", "two, perturbed", "two, evaluated"]
-    assert minutes["one, evaluated"].tolist() == [[pytest.approx(2.9 / 60), 0.4]]
-    assert balls["two, evaluated"].tolist() == [[30_000, 0.4]]
-    np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
-    assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
-    assert (
-        share(
-            learning_curves.draw_curves(tmp_path / "a" / "curves.png", [Curve("one", rows, 100)]),
-            "#1f77b4",
-        )
-        > 0.0005
-    )

@@ -11,7 +11,6 @@ from PIL import Image
 from experiments.evaluation import video
 from experiments.view.replay import RATE, Replay
 from mjx_tt.robot.mjcf import home_qpos, load_model
-from mjx_tt.viz.caption import GOOD, POOR
 from mjx_tt.viz.rendering import BRIGHT
 
 CONTACT, SECONDS, SPEED = 0.5, 1.0, 5.0
@@ -45,19 +44,6 @@ def test_video_is_in_real_time_but_for_the_contact(replay):
     )  # smooth, though replays have 300 frames a second
 
 
-def test_caption_has_number_speed_and_outcome_and_does_not_know_it_before(replay):
-    moments = list(video.video_moments(replay, 3, 25.0))
-    before = [m for m in moments if m.caption.text == "5.0 m/s in"]
-    after = [m for m in moments if m.caption.text == replay.outcome]
-    assert len(before) + len(after) == len(moments)
-    assert {m.caption.title for m in moments} == {"Ball 3"}
-    assert after[0].caption.colour == GOOD
-    assert before[-1].ball[1] == pytest.approx(-1.3, abs=SPEED / 8 / 25 + 1e-9)
-    missed = replace(replay, outcome="missed, 5.0 m/s", contact=float("nan"))
-    assert list(video.video_moments(missed, 1, 25.0))[-1].caption.colour == POOR
-    assert not any(m.caption.note for m in video.video_moments(missed, 1, 25.0))
-
-
 def test_trail_is_the_balls_last_third_of_a_second_and_ends_at_it(replay):
     moment = next(m for m in video.video_moments(replay, 1, 25.0) if m.caption.note)
     flown = np.linalg.norm(np.diff(moment.trail, axis=0), axis=1).sum()
@@ -81,8 +67,3 @@ def test_picture_is_of_the_contact_with_the_whole_way(replay, tmp_path):
     image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     assert image.shape == (*video.PICTURE_SIZE[::-1], 3)
     assert (np.abs(image - 255 * np.array(BRIGHT)) < 60).all(axis=-1).sum() > 1000
-
-
-def test_suffix_is_checked_before_anything_is_drawn(replay, tmp_path):
-    with pytest.raises(ValueError, match=r"a\.webp: suffix '\.webp'; allowed: \.png, \.mp4, \.gif"):
-        video.draw(tmp_path / "a.webp", [replay])

@@ -22,16 +22,13 @@ import pytest
 import yaml
 from rich.console import Console
 
-from ballmodel.distribution import load_distribution
 from bgs import strategy
-from experiments import cli
 from experiments.config import build
 from experiments.config import experiment as config
 from experiments.config.finetuning import FineTuning
 from experiments.errors import RunError
 from experiments.finetuning import loop
-from experiments.finetuning import report as finetune_report
-from experiments.finetuning.journal import BEFORE, TRAINING, Entry, Journal
+from experiments.finetuning.journal import TRAINING, Entry, Journal
 from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
@@ -496,30 +493,3 @@ def test_stop_and_continue_and_pause(source, tmp_path):
 
 
 # Measurements
-
-
-@pytest.mark.slow
-def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
-    """fit-human finds what was thrown, from the noisy samples of the emulated tracker."""
-    robot, thrown, played = LockStepRobot(throws()), throws(), []
-    theta = np.zeros(contract.n_parameters(), np.float32)
-    for number in range(BALLS):
-        ball = robot.play(Policy(theta, MEAN, INVERSE_SCALE), number)
-        assert np.all(np.diff(ball.trajectory[:, 0]) > 0)
-        np.testing.assert_allclose(ball.trajectory[0, 1:], thrown.position[:, number], atol=0.1)
-        played.append(Entry(BEFORE, 0, 0, number, number, ball.summary, {}, 0.0, False, ball.trajectory))
-    again = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4)
-    np.testing.assert_array_equal(again.trajectory, played[4].trajectory)
-    assert again.summary == played[4].summary
-    means = np.array(again.summary.observed[: contract.N_OBSERVATION]) / again.summary.steps
-    assert thrown.position[1].min() > means[1] > -2.9 and -1.0 < means[0] < 1.0  # of the ball's way to the robot
-    other = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4 + BALLS)  # the same ball, seen with other noise
-    assert not np.array_equal(other.trajectory[:5], again.trajectory[:5])
-
-    path = tmp_path / "balls.csv"
-    assert finetune_report.write_human_balls(path, "monday", played) == BALLS
-    given = ["fit-human", str(path), "--fit", "gauss-newton", "--eps", "100", "--out", str(tmp_path / "anna.yaml")]
-    assert cli.main(given) == 0
-    found = load_distribution(tmp_path / "anna.yaml")
-    np.testing.assert_allclose(found.velocity_max[1], thrown.velocity[1].max(), atol=0.25)
-    np.testing.assert_allclose(found.velocity_min[1], thrown.velocity[1].min(), atol=0.25)

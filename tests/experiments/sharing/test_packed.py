@@ -18,7 +18,6 @@ import yaml
 
 from experiments import cli
 from experiments.config.experiment import parse
-from experiments.errors import RunError
 from experiments.runs.locate import SHIPPED
 from experiments.sharing import packed
 from experiments.sharing.packed import MEMBERS, SUMS, PackError, pack, read, unpack, zipped
@@ -181,21 +180,6 @@ def test_a_policy_whose_golden_vectors_do_not_come_out_is_refused(file, tmp_path
     with pytest.raises(PackError, match=r"other.zip: artefact/golden.npz: .* differs from the golden outputs by 0.001"):
         unpack(path, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["other.zip"]
-
-
-def test_a_run_that_is_not_finished_is_not_packed(run, tmp_path):
-    shutil.copytree(run, other := tmp_path / "other")
-    (other / "checkpoints").mkdir()
-    (other / "checkpoints" / "00002700.npz").write_bytes(b"")
-    with pytest.raises(RunError, match=r"of different updates \(\['2600', '2700'\]\)"):
-        pack(other, tmp_path / "a.zip")
-    (other / "evaluation.json").unlink()
-    with pytest.raises(RunError, match="was not evaluated yet: `mjx-tt evaluate"):
-        pack(other, tmp_path / "a.zip")
-    shutil.rmtree(other / "artefact")
-    with pytest.raises(RunError, match="not exported yet"):
-        pack(other, tmp_path / "a.zip")
-    assert not (tmp_path / "a.zip").exists()
 
 
 def test_commands(run, tmp_path, capsys, monkeypatch):

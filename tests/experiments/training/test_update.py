@@ -210,27 +210,6 @@ def test_the_same_yaml_trains_under_both_engines():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
-def test_at_the_papers_size_mjx_makes_the_update_of_the_fused_engine():
-    """200 pairs x 15 episodes: the same balls, latencies and perturbations, by two implementations of the robot."""
-    change, metrics = {}, {}
-    for engine in ("fused", "mjx"):
-        settings = experiment.load(experiment.shipped()["paper_mjx"], (f"task.engine={engine}",))
-        trainer = trainer_of(build.experiment(settings, "paper_mjx"))
-        assert trainer.episodes_per_update == 6000
-        start = trainer.init(build.key(0, build.INITIAL_STATE))
-        after, measured = trainer.update(start)
-        change[engine] = np.asarray(after.bgs.theta) - np.asarray(start.bgs.theta)
-        metrics[engine] = jax.tree.map(float, measured)
-    fused, mjx = change["fused"], change["mjx"]
-    assert metrics["mjx"]["non_finite"] == metrics["mjx"]["failed_pairs"] == 0
-    assert metrics["mjx"]["mean_return"] == pytest.approx(metrics["fused"]["mean_return"], rel=1e-3)
-    assert metrics["mjx"]["steps"] == pytest.approx(metrics["fused"]["steps"], rel=1e-3)
-    assert np.linalg.norm(fused) > 1e-3
-    assert fused @ mjx > 0.99 * np.linalg.norm(fused) * np.linalg.norm(mjx)
-
-
-@pytest.mark.slow
 def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
     changed = reward_weights.SIM_WEIGHTS | {"state_transition": 0.0}

@@ -65,12 +65,6 @@ def test_inputs_and_outputs_are_the_policys(pair):
     np.testing.assert_allclose(output.values, wanted, atol=1e-4)
 
 
-def test_balls_that_it_misses_are_missed_again_when_they_are_shown(pair):
-    pair.values = pair.recorder.nominal() | {"latency.ball_observation": 0.09}
-    assert pair.find_missed() > 0
-    assert all(not pair.replays(n)[0].outcome.startswith("returned") for n in range(len(pair.missed)))
-
-
 def test_a_randomised_parameter_is_drawn_until_its_slider_is_moved():
     path = "ball.table.restitution"
     recorder = Recorder(TaskConfig(), ModelFile(SimModel(), (Range(path, 0.8, 0.9),)))

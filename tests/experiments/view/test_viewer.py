@@ -159,28 +159,6 @@ def test_a_slider_moved_in_the_page_changes_what_the_simulation_does(shown, open
     until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the replay as before")
 
 
-def test_balls_are_chosen_in_the_page(shown, open_page, play):
-    viewer, address = shown(play)
-    page = open_page(address)
-    page.get_by_role("button", name="Pause").click()
-    until(lambda: not viewer.playing, "paused")
-    shown_before = viewer.number
-    page.get_by_role("button", name="ball ▶").click()
-    until(lambda: viewer.number == shown_before + 1 and viewer.t == 0.0, "the next ball's start")
-    page.get_by_role("button", name="▶", exact=True).click()
-    until(lambda: viewer.t == pytest.approx(1 / 75, abs=1e-6), "one control tick later")
-    play.values["latency.ball_observation"] = 0.09
-    page.get_by_role("button", name="Give me the balls that it misses").click()
-    until(lambda: "Missed ball 1" in page.content(), "the caption")
-    box = number(page, "velocity y [m/s]")
-    box.fill("-4.5")
-    box.press("Enter")
-    until(lambda: play.balls is None and play.ball[4] == pytest.approx(-4.5), "one ball, thrown by hand")
-    page.get_by_label("balls").or_(page.locator("input[value='one ball']")).first.click()
-    page.get_by_role("option", name="narrow", exact=True).click()
-    until(lambda: play.balls == "narrow" and "Ball 1 of narrow" in page.content(), "another distribution")
-
-
 def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, recorder):
     yaml = write_tiny(tmp_path, updates=100_000, evaluate_every=100_000, checkpoint_seconds=1)
     command = [sys.executable, "-m", "experiments.cli", "train", str(yaml), "--out", str(tmp_path)]

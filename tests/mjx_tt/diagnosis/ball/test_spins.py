@@ -59,22 +59,6 @@ def _log(tmp_path, world, balls, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), (0.80, 0.11)])
-def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restitution, friction):
-    """The straight line from the nominal model leads to a spin that is not there."""
-    rng = np.random.default_rng(4)
-    found = diagnose(_log(tmp_path, World(restitution=restitution, friction=friction), draw_balls(rng, 60), rng))
-    causes = {c.name: c for c in found.verdict.causes}
-    assert found.verdict.verdict == "named" and set(causes) == {"table_restitution", "table_friction"}
-    for name, path, true in (
-        ("table_restitution", "ball.table.restitution", restitution),
-        ("table_friction", "ball.table.friction", friction),
-    ):
-        estimate = causes[name].parameters[path]
-        assert abs(estimate.estimate - true) < 0.003 and estimate.high - estimate.low < 0.01
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.93, 0.89])
 def test_bounces_that_differ_from_ball_to_ball_are_no_cause_and_hide_none(tmp_path, restitution):
     """The table's restitution and friction are drawn anew for every ball, which is not what the fit assumes of them."""
