@@ -19,7 +19,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +56,6 @@ BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "16": (("human_deleted", None, 0.5), ("human_invented", None, 0.5)),
     "17": (("many", None, 1.0), ("bounce", None, 0.5)),
     "18": (("kalman", None, 1.0),),
-    "19": (("scattered", 20.0, 1.0),),
-    "extra": (("rare", None, 0.5), ("invisible", None, 0.1)),
 }
 PEOPLES_BARS = ("13", "14", "15", "16")
 
@@ -122,19 +120,8 @@ def examine(case: Case, folder: Path) -> dict:
     record |= {"twins": truth["twins"], "amounts": truth["amounts"]}
     if isinstance(drawn, BallCase) and case.kind in GAINED:
         record["gain"] = gain(drawn, folder / "out" / "extended.yaml")
-    if case.kind == "gauge":
-        record["reading"] = _with_reading(case, truth, files, folder)
     record["all_seconds"] = time.perf_counter() - began
     return record
-
-
-def _with_reading(case: Case, truth: dict, files: list[Path], folder: Path) -> str:
-    """Outcome once an instrument has cleared the other members: they may no longer be named."""
-    cause = case.causes[0]
-    others = [*truth["twins"][cause], *truth["kin"][cause]]
-    reading = replace(case, without=tuple(others))
-    verdict = diagnose(files, folder / "reading", _options(reading, folder))
-    return scoring.score(truth, verdict)["outcome"]
 
 
 def gain(drawn: BallCase, extended: Path) -> dict[str, float]:

@@ -16,7 +16,6 @@ from tests.exam.generator.sessions import NOISES, WRONG_NOISES, Balls, Log, draw
 from tests.exam.generator.world import World
 
 MAGNUS = 0.6  # k of a ball that curves
-RARE_SHARE, RARE_FACTOR = 0.05, 6.0  # an effect of a few balls, and by how much more than the case's size
 SCALING_BALLS, SCALING_ROUNDS = 80, 5
 LEAST_LAG = 0.005  # [m] of a Kalman filter that is worth a name
 
@@ -27,7 +26,7 @@ class Effect:
 
     field, rule: the World's number and what an amount ``a`` makes of it
     amount: of about 10 mm; signs: allowed ones
-    twins: names that no ball log can tell apart from it; kin: names that look alike in a log of this length
+    twins: names that no ball log can tell apart from it
     truth: amount -> value for every model path that expresses the effect, the twins' included
     """
 
@@ -37,7 +36,6 @@ class Effect:
     truth: Callable[[float], dict[str, float]]
     signs: tuple[int, ...] = (-1, 1)
     twins: tuple[str, ...] = ()
-    kin: tuple[str, ...] = ()
 
 
 def _plus(value, a):
@@ -77,11 +75,11 @@ def _others(names, name):
 
 
 def _drag_effect(name, number, rule):
-    return Effect(number, rule, 0.02, _drag, twins=_others(_DRAG, name), kin=("ball_radius",))
+    return Effect(number, rule, 0.02, _drag, twins=_others(_DRAG, name))
 
 
 def _gravity_effect(name, number, rule, signs=(-1, 1)):
-    return Effect(number, rule, 0.008, _gravity, signs, _others(_GRAVITY, name), ("camera_scale", "wind_z"))
+    return Effect(number, rule, 0.008, _gravity, signs, _others(_GRAVITY, name))
 
 
 EFFECTS: dict[str, Effect] = {
@@ -91,13 +89,9 @@ EFFECTS: dict[str, Effect] = {
     "magnus": Effect("magnus_coefficient", lambda k, a: MAGNUS, 4.0, lambda a: {}, (1,)),
     "wind_x": Effect("wind_x", _plus, 0.12, _one("ball.flight.wind_x")),
     "wind_y": Effect("wind_y", _plus, 0.07, _one("ball.flight.wind_y")),
-    "wind_z": Effect("wind_z", _plus, 0.12, _one("ball.flight.wind_z"), kin=_GRAVITY),
-    "gravity_tilt_x": Effect(
-        "gravity_x", _plus, 0.08, _one("ball.flight.gravity_x"), kin=_others(_TILT_X, "gravity_tilt_x")
-    ),
-    "gravity_tilt_y": Effect(
-        "gravity_y", _plus, 0.08, _one("ball.flight.gravity_y"), kin=_others(_TILT_Y, "gravity_tilt_y")
-    ),
+    "wind_z": Effect("wind_z", _plus, 0.12, _one("ball.flight.wind_z")),
+    "gravity_tilt_x": Effect("gravity_x", _plus, 0.08, _one("ball.flight.gravity_x")),
+    "gravity_tilt_y": Effect("gravity_y", _plus, 0.08, _one("ball.flight.gravity_y")),
     "gravity_scale": _gravity_effect("gravity_scale", "gravity_z", _times),
     "buoyancy": _gravity_effect("buoyancy", "buoyancy", lambda b, a: b - a, (-1,)),
     "clock_rate": _gravity_effect("clock_rate", "clock_rate", lambda c, a: c * (1 + a) ** -0.5),
@@ -108,22 +102,15 @@ EFFECTS: dict[str, Effect] = {
         0.015,
         _one("ball.table.restitution", 0.93),
         (-1,),
-        kin=_others(_BOUNCE, "table_restitution"),
     ),
-    "table_restitution_speed": Effect(
-        "restitution_slope", _plus, 0.005, _one("ball.table.restitution_slope"), (1,), kin=("table_restitution",)
-    ),
+    "table_restitution_speed": Effect("restitution_slope", _plus, 0.005, _one("ball.table.restitution_slope"), (1,)),
     "table_friction": Effect("friction", _plus, 0.03, _one("ball.table.friction", 0.25)),
     "table_height": Effect("height", _plus, 0.005, _one("ball.table.height")),
-    "table_tilt_x": Effect("tilt_x", _plus, 0.006, _one("ball.table.tilt_x"), kin=_others(_TILT_X, "table_tilt_x")),
-    "table_tilt_y": Effect("tilt_y", _plus, 0.006, _one("ball.table.tilt_y"), kin=_others(_TILT_Y, "table_tilt_y")),
-    "camera_scale": Effect("camera_scale", _plus, 0.01, _one("sensing.camera_scale", 1.0), kin=_GRAVITY),
-    "camera_rotation_x": Effect(
-        "camera_rotation_x", _plus, 0.004, _one("sensing.camera_rotation_x"), kin=_others(_TILT_Y, "camera_rotation_x")
-    ),
-    "camera_rotation_y": Effect(
-        "camera_rotation_y", _plus, 0.004, _one("sensing.camera_rotation_y"), kin=_others(_TILT_X, "camera_rotation_y")
-    ),
+    "table_tilt_x": Effect("tilt_x", _plus, 0.006, _one("ball.table.tilt_x")),
+    "table_tilt_y": Effect("tilt_y", _plus, 0.006, _one("ball.table.tilt_y")),
+    "camera_scale": Effect("camera_scale", _plus, 0.01, _one("sensing.camera_scale", 1.0)),
+    "camera_rotation_x": Effect("camera_rotation_x", _plus, 0.004, _one("sensing.camera_rotation_x")),
+    "camera_rotation_y": Effect("camera_rotation_y", _plus, 0.004, _one("sensing.camera_rotation_y")),
     "camera_distortion": Effect("camera_distortion", _plus, 0.004, _one("sensing.camera_distortion")),
     "latency_jitter": Effect("jitter", _plus, 0.005, _one("sensing.jitter"), (1,)),
     "tracker_smoothing": Effect("smoothing", _plus, 0.008, _one("sensing.smoothing"), (1,)),
@@ -136,8 +123,6 @@ LOOKALIKES = (
     ("table_restitution", "table_restitution_speed"),
     ("table_tilt_y", "camera_rotation_x"),
 )
-# No ball log shows it, so that its size is not millimetres but [rad]; the right answer is that nothing can be named.
-INVISIBLE = {"camera_rotation_z": 0.02}
 # Of a pair, one member of each family at most: two that look alike make one case of the other.
 FAMILIES = (
     _DRAG,
@@ -167,10 +152,9 @@ ROBOT_EFFECTS: dict[str, tuple[float, float]] = {
 class Case:
     """One hidden case; everything follows from these numbers.
 
-    kind: none, noise (nothing but the noise is wrong), invisible, single, pair, triple, gauge, deleted, invented, rare,
-        many (2 to 8 causes of ordinary sizes), bounce (60 balls on a table of another restitution and friction, far
-        off), scattered (nothing or one cause, and a table of another restitution and friction at every bounce), robot,
-        unexcited, robot_none; human_none, human_single ... where people play
+    kind: none, noise (nothing but the noise is wrong), single, pair, triple, gauge, deleted, invented, many (2 to 8
+        causes of ordinary sizes), bounce (60 balls on a table of another restitution and friction, far off), kalman,
+        robot, unexcited, robot_none; human_none, human_single ... where people play
     causes: catalogue names, a name of INVENTED, or <joint>.<effect>
     without: names that the diagnosis may not use
     """
@@ -219,7 +203,7 @@ class BallCase:
         """Sealed content: the case, the accepted answers, and the values on every model path that expresses them."""
         values: dict[str, float] = {}
         for cause, amount in self.amounts.items():
-            if cause in EFFECTS and self.case.kind != "rare":
+            if cause in EFFECTS:
                 values |= EFFECTS[cause].truth(amount)
         return {
             "case": asdict(self.case),
@@ -229,7 +213,6 @@ class BallCase:
             if self.spin_std.any()
             else None,
             "twins": {c: EFFECTS[c].twins for c in self.amounts if c in EFFECTS},
-            "kin": {c: EFFECTS[c].kin for c in self.amounts if c in EFFECTS},
             "lookalikes": {c: [o for pair in LOOKALIKES if c in pair for o in pair if o != c] for c in self.amounts},
         }
 
@@ -245,7 +228,7 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
     balls: other balls in the same world (for held-out tests); the amounts stay those of the case's own balls.
     """
     own = draw_balls(_generator(case, "balls"), case.count)
-    target = 1e-3 * case.size_mm * (RARE_FACTOR if case.kind == "rare" else 1.0)
+    target = 1e-3 * case.size_mm
     few = own.take(np.sort(_generator(case, "few").permutation(len(own))[:SCALING_BALLS]))
     amounts = {}
     for cause in case.causes:
@@ -256,7 +239,7 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
         elif case.kind == "many":
             amounts[cause] = sign * EFFECTS[cause].amount * abs(_generator(case, f"size {cause}").standard_normal())
         else:
-            amounts[cause] = sign * (INVISIBLE.get(cause) or _scaled(case, cause, sign, few, target))
+            amounts[cause] = sign * _scaled(case, cause, sign, few, target)
     world = World(magnus_coefficient=MAGNUS) if case.human else World()
     if balls is None:
         balls = draw_human(_generator(case, "people"), case.count, world) if case.human else own
@@ -266,25 +249,10 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
         world, spinning = _apply(case, cause, amount, world, spinning)
         if cause == "magnus":
             mean, std = (amount * s for s in _spin_shape(case))
-    if case.kind == "rare":
-        world, spinning = _only_some(case, world, spinning, balls)
-    if case.kind == "scattered":
-        world = _scattered(case, world, balls)
     kalman = _kalman(case, few) if case.kind == "kalman" else None
     if kalman is not None:
         amounts["tracker_filter"] = kalman[0]
     return BallCase(case, world, spinning, amounts, mean, std, kalman and kalman[1:])
-
-
-def _scattered(case: Case, world: World, balls: Balls) -> World:
-    """A table that is another one at every bounce: by some per cent of a speed, not by the same kick for all balls."""
-    rng = _generator(case, f"bounces {len(balls)}")
-    restitution, friction = rng.uniform(0.008, 0.025), rng.uniform(0.05, 0.2)
-    return replace(
-        world,
-        restitution=world.restitution + rng.normal(0.0, restitution, len(balls)),
-        friction=world.friction * (1.0 + rng.normal(0.0, friction, len(balls))),
-    )
 
 
 def _kalman(case: Case, balls: Balls) -> tuple[float, float, float]:
@@ -320,8 +288,6 @@ def _apply(case: Case, cause: str, amount: float, world: World, balls: Balls) ->
     if cause in INVENTED:
         return INVENTED[cause].apply(world, amount, balls, _generator(case, cause)), balls
     effect = EFFECTS[cause] if cause in EFFECTS else None
-    if cause == "camera_rotation_z":
-        return replace(world, camera_rotation_z=amount), balls
     if effect is None:
         raise ValueError(f"unknown cause {cause!r}; known are {', '.join((*EFFECTS, *INVENTED))}")
     if cause == "magnus":
@@ -343,18 +309,6 @@ def draw_spins(case: Case, balls: Balls, amount: float) -> np.ndarray:
     white = _generator(case, f"spins {len(balls)}").standard_normal((3, len(balls)))
     direction = np.where(balls.human, 1.0, -1.0)
     return amount * (mean[:, None] * direction + std[:, None] * white)
-
-
-def _only_some(case: Case, world: World, spinning: Balls, balls: Balls) -> tuple[World, Balls]:
-    """The changed world for RARE_SHARE of the balls and the nominal one for the rest."""
-    affected = _generator(case, f"rare {len(balls)}").random(len(balls)) < RARE_SHARE
-    affected[:3] |= not affected.any()
-    nominal, changed = World(), {}
-    for name, value in asdict(nominal).items():
-        new = getattr(world, name)
-        if isinstance(value, float) and new != value:
-            changed[name] = np.where(affected, new, value)
-    return replace(nominal, **changed), with_spin(spinning, np.where(affected, spinning.start[6:], 0.0))
 
 
 @dataclass(frozen=True)
@@ -387,7 +341,6 @@ class RobotCase:
             "parameters": values,
             "spin": None,
             "twins": twins,
-            "kin": {},
             "lookalikes": {},
         }
 
@@ -423,17 +376,14 @@ SIZES = (5.0, 10.0, 20.0)
 KINDS = (
     "none",
     "noise",
-    "invisible",
     "single",
     "pair",
     "triple",
     "gauge",
     "deleted",
     "invented",
-    "rare",
     "many",
     "bounce",
-    "scattered",
     "robot",
     "unexcited",
     "robot_none",
@@ -491,7 +441,7 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
         if kind == "deleted":
             # Every other time the twins are gone as well, so that nothing true is left to name.
             effect = EFFECTS[causes[0]]
-            radius = tuple(k for k in effect.kin if k == "ball_radius")
+            radius = ("ball_radius",) if causes[0] in _DRAG else ()
             without = causes if i % 2 else (*causes, *effect.twins, *radius)
         noise, seed_ = str(noises[i % len(noises)]), int(rng.integers(2**31))
         balls = BOUNCE_BALLS if kind == "bounce" else None
@@ -507,18 +457,12 @@ def _round(
         return [()]
     if kind == "bounce":
         return [tuple(BOUNCES)]
-    if kind == "scattered":
-        return [(), (str(rng.choice([name for name in singles if name != "magnus"])),)]
-    if kind == "invisible":
-        return [(name,) for name in INVISIBLE]
     if kind in ("single", "deleted"):
         pool = [(name,) for name in singles if name not in too_large]
     elif kind == "gauge":
         pool = [(name,) for name in (*_DRAG, *_GRAVITY, *_TILT_X, *_TILT_Y)]
     elif kind == "invented":
         pool = [(name,) for name in INVENTED]
-    elif kind == "rare":
-        pool = [(name,) for name in ("wind_x", "magnus", "table_restitution", "drag_coefficient", "table_friction")]
     elif kind == "many":
         return [tuple(rng.choice(MANY, rng.integers(2, 9), replace=False).tolist()) for _ in range(10)]
     elif kind in ("pair", "triple"):

@@ -36,7 +36,7 @@ def score(truth: dict, verdict: dict) -> dict:
         accepted["magnus"].add("magnus_coefficient")
     if kind == "deleted":
         accepted = {c: {c, *truth["twins"].get(c, ()), *truth["lookalikes"].get(c, ())} for c in causes}
-    elif kind in ("invented", "invisible", "unexcited"):
+    elif kind in ("invented", "unexcited"):
         accepted = {}
     record["outcome"] = _outcome(kind, accepted, named, verdict["verdict"])
     record["leads"] = _leads(accepted, verdict)
@@ -51,7 +51,7 @@ def score(truth: dict, verdict: dict) -> dict:
         record["parameters"] = parameter_errors(truth, verdict)
     if kind == "many" or (kind == "robot" and record["outcome"] == "right"):
         record["parameters"] = parameter_errors(truth, verdict)
-    if kind in ("unexcited", "invisible"):
+    if kind == "unexcited":
         declared = set(verdict.get("not_excited", ())) | set(verdict.get("not_identifiable", ()))
         flat = {name for entry in declared for name in _names(entry)}
         record["declared"] = all(c in flat for c in causes)
@@ -78,9 +78,7 @@ def _outcome(kind: str, accepted: dict[str, set[str]], named: list[set[str]], ve
     if verdict in ABSTAINED:
         return "flagged"
     if not named:
-        if kind == "scattered" and not accepted:
-            return "right"
-        return "missed" if kind not in ("none", "noise", "robot_none", "unexcited", "invisible") else "right"
+        return "missed" if kind not in ("none", "noise", "robot_none", "unexcited") else "right"
     hit = [cause for cause, names in accepted.items() if any(names & group for group in named)]
     false = [group for group in named if not any(names & group for names in accepted.values())]
     # Two named groups for one true cause are one name too many.
@@ -218,7 +216,6 @@ def table(records: list[dict]) -> list[Row]:
     right, flagged, wrong = "right", "flagged", "wrong"
     exact = [r for r in by["gauge"] if any(r["twins"].values())]
     alone = [r["outcome"] == right and not r["twins_reported"] for r in exact]
-    readings = [r["reading"] == right for r in by["gauge"] if "reading" in r]
     declared = [r["outcome"] == right and r["declared"] for r in by["unexcited"] if "declared" in r]
     leads = [r["leads"] for r in records if r.get("leads")]
     delays = [_delay_error(r) <= 2e-3 for r in _delays(by["robot"])]
@@ -234,7 +231,6 @@ def table(records: list[dict]) -> list[Row]:
         _share("4", "triples: exact set", ">= 70 %", ended("triple", right)),
         _share("5", "exact gauge: one member reported alone", "<= 0 %", alone),
         _share("5", "gauge groups: right group", ">= 95 %", ended("gauge", right)),
-        _share("5", "with the extra reading: right member", ">= 95 %", readings),
         *_parameter_rows([r for r in by["single"] if r["case"]["size_mm"] == 10.0]),
         _share("6", "90 % intervals that cover, one effect of any size", "85-95 %", _covered(by["single"])),
         _share("6", "90 % intervals that cover, robot", "-", _covered(by["robot"])),
@@ -261,11 +257,6 @@ def table(records: list[dict]) -> list[Row]:
         _share("17", "restitution and friction far off, 60 balls: wrong name", "<= 2 %", ended("bounce", wrong)),
         _share("18", "a tracker's Kalman filter: named", ">= 90 %", ended("kalman", right)),
         _share("18", "a tracker's Kalman filter: wrong name", "<= 2 %", ended("kalman", wrong)),
-        _share("19", "another table at every bounce: right", "-", ended("scattered", right)),
-        _share("19", "another table at every bounce: wrong name", "<= 2 %", ended("scattered", wrong)),
-        _share("-", "in 5 % of the balls only: flagged or right", "-", ended("rare", flagged, right)),
-        _share("-", "in 5 % of the balls only: wrong name", "-", ended("rare", wrong)),
-        _share("-", "invisible in a ball log: named", "-", named("invisible")),
         _share("-", "a cause leads beside what is unexplained: true", "-", [x == "right" for x in leads]),
         _share("-", "any log: a false cause leads", "-", [r.get("leads") == "wrong" for r in records]),
         _share("-", "ended with an error", "-", [r["outcome"] == "error" for r in records]),

@@ -67,8 +67,6 @@ def kind_of(causes: tuple[str, ...]) -> str:
         return "robot"
     if any(c in INVENTED for c in causes):
         return "invented"
-    if causes and all(c in cases.INVISIBLE for c in causes):
-        return "invisible"
     return ("none", "single", "pair", "triple")[len(causes)]
 
 
@@ -78,7 +76,7 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=10.0, help="median shift of the last sample [mm]")
     parser.add_argument("--noise", default="iid", choices=(*NOISES, *WRONG_NOISES))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kind", choices=cases.KINDS, help="rare, unexcited ...; by default what the causes make")
+    parser.add_argument("--kind", choices=cases.KINDS, help="deleted, unexcited ...; by default what the causes make")
     parser.add_argument("--balls", type=int, help="number of balls; drawn between 200 and 500 by default")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
