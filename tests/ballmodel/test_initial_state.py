@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 
-from ballmodel import registry
 from ballmodel.aerodynamics import FlightParams
-from ballmodel.fit_distribution import fit_human
-from ballmodel.flight import ball_params
 from ballmodel.initial_state import fit_gauss_newton, fit_nelder_mead
 from ballmodel.io import read
-from ballmodel.sampling import sample_pool
-from ballmodel.trajectory import Dataset, Trajectory, free_flight
+from ballmodel.trajectory import Trajectory, free_flight
 from tests.support.paths import MEASURED
 
 K_D = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
@@ -85,15 +80,6 @@ def test_covariance_predicts_the_error():
     assert np.mean(squared) == pytest.approx(6.0, abs=4 * 0.18)
 
 
-def test_a_batch_of_different_lengths_equals_single_fits():
-    trajectories, _ = balls(6, [8, 30, 15, 32, 5, 21], 0.002, seed=2)
-    together = fit_gauss_newton(trajectories, FlightParams())
-    for i, trajectory in enumerate(trajectories):
-        alone = fit_gauss_newton([trajectory], FlightParams())
-        np.testing.assert_allclose(unknowns(together.state)[:, i], unknowns(alone.state)[:, 0], atol=1e-9)
-        np.testing.assert_allclose(together.covariance[..., i], alone.covariance[..., 0], rtol=1e-6)
-
-
 def test_known_spin_is_used():
     spin = np.array([70.0, -20.0, 30.0])
     trajectories, truth = balls(5, 40, 0.0, magnus=0.6, spin=spin)
@@ -116,31 +102,6 @@ def test_huber_loss_shrugs_off_stray_samples():
     errors = [np.abs(unknowns(r.state) - truth).max(axis=0) for r in (plain, robust)]
     assert np.all(errors[1] < 0.1 * errors[0])
     assert robust.converged.all()
-
-
-@pytest.mark.slow
-def test_trajectories_of_a_distribution_give_its_numbers_back():
-    """Balls drawn from a box, measured with noise up to their bounce, fitted: the box returns from inside."""
-    target = registry.load("medium")
-    pool = sample_pool(jax.random.key(0), target, ball_params(), 300)
-    rng = np.random.default_rng(0)
-    trajectories = []
-    for i in range(300):
-        start = np.concatenate([pool.state.position[:, i], pool.state.velocity[:, i]])
-        time = np.arange(200) / 125
-        clean = flight(start, time)
-        airborne = clean[:, : int(np.argmax(clean[2] < 0.02))]
-        noisy = airborne + rng.normal(0, 0.002, airborne.shape)
-        trajectories.append(Trajectory("home", str(i), time[: airborne.shape[1]], noisy))
-    distribution, report = fit_human(Dataset(tuple(trajectories), "synthetic"), ball_params(), name="me")
-    assert report.measured == 300 and report.landing.shape[1] > 290
-    assert np.median(report.fit_rms) == pytest.approx(0.002 * np.sqrt(3), rel=0.1)
-    kept = ~report.outliers.outlier
-    drawn = np.concatenate([pool.state.position, pool.state.velocity, pool.landing])
-    for name, low, high in (("position", 0, 3), ("velocity", 3, 6), ("landing", 6, 8)):
-        np.testing.assert_allclose(getattr(distribution, f"{name}_min"), drawn[low:high].min(1), atol=0.1)
-        np.testing.assert_allclose(getattr(distribution, f"{name}_max"), drawn[low:high].max(1), atol=0.1)
-    assert kept.mean() > 0.9
 
 
 @pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")

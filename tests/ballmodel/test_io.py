@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -168,24 +166,6 @@ def test_deepmind_states():
     np.testing.assert_allclose(data.state.spin[:, 0], [62.81, -5.84, -7.62], atol=1e-6)
     assert np.median(np.linalg.norm(data.state.velocity, axis=0)) == pytest.approx(5.5, abs=0.1)
     assert np.mean(data.state.velocity[1] < 0) == pytest.approx(0.92, abs=0.01)
-
-
-def test_malformed_deepmind_states_name_entry_and_field(tmp_path):
-    path = tmp_path / "states.json"
-    entry = {"id": 1, **{f"{p}_{a}": 0.5 for p in ("pos", "vel", "w_vel") for a in "xyz"}}
-    path.write_text(json.dumps([entry]))
-    assert read(path).state.position.shape == (3, 1)
-    for change, message in (
-        ({"vel_y": "fast"}, "entry 1, field 'vel_y': a finite number is wanted, got 'fast'"),
-        ({"pos_x": None}, "entry 1, field 'pos_x'"),
-        ({"w_vel_z": float("nan")}, "entry 1, field 'w_vel_z'"),
-    ):
-        path.write_text(json.dumps([entry, {**entry, **change}]))
-        with pytest.raises(ValueError, match=message):
-            read(path)
-    path.write_text("[{")
-    with pytest.raises(ValueError, match="states.json: not readable as a table"):
-        read(path)
 
 
 @needs_data

@@ -1,23 +1,18 @@
 """Tracks in the forms that people's files have, each read as the same balls.
 
-The balls are SciPy-free parabolas with one bounce; the forms are written by hand here, and by a program of other
-people's making where the shared one lies beside the repository.
+The balls are SciPy-free parabolas with one bounce; the forms are written by hand here.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from ballmodel.io import TrackOptions, read
-from tests.support.paths import MEASURED
 
-FORMS = MEASURED.parent / "repro" / "tracks"
 RATE = 120.0
 
 
@@ -143,13 +138,3 @@ def test_what_a_person_says_counts(tmp_path):
     assert_same(read(path, options=TrackOptions(length="m")))
     with pytest.raises(ValueError, match="unit of length: expected one of m, cm, mm, got 'inch'"):
         TrackOptions(length="inch")
-
-
-@pytest.fixture(scope="module")
-def forms(tmp_path_factory):
-    if not FORMS.is_dir():
-        pytest.skip(f"no forms of other people's making in {FORMS}")
-    folder = tmp_path_factory.mktemp("forms")
-    done = subprocess.run([sys.executable, str(FORMS / "make_forms.py"), str(folder)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return folder

@@ -236,17 +236,3 @@ def test_equal_configurations_share_one_compilation():
         for key in jax.random.split(jax.random.key(seed), 3):
             state, _ = bgs.tell(state, bgs.ask(key, state, config), jax.random.normal(key, 14), config)
     assert (strategy._sample._cache_size() - before[0], bgs.tell._cache_size() - before[1]) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("num_directions", 2.5),
-        ("sigma", 0.0),
-        ("rank", "top"),
-        ("ema_decay", 1.0),
-    ],
-)
-def test_bad_configuration_names_key_value_and_choice(key, value):
-    with pytest.raises(ValueError, match=rf"BGSConfig\.{key} = {value!r}, allowed is"):
-        bgs.BGSConfig(**{key: value})

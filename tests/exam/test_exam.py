@@ -104,14 +104,6 @@ def test_flight_and_bounce_agree_with_scipy():
     np.testing.assert_allclose(flight.at(times[:, None])[..., 0], path, atol=1e-9)
 
 
-def test_balls_are_independent_of_each_other():
-    both = np.stack([START, START * 0.9], axis=1)
-    world = replace(WORLD, restitution=np.array([0.9, 0.8]))
-    together = fly(world, both, 0.6).second
-    alone = fly(world.take(np.array([1])), both[:, 1:], 0.6).second
-    np.testing.assert_array_equal(together[..., 1], alone[..., 0])
-
-
 def test_camera_is_rotation_scale_and_distortion():
     angles = {"camera_rotation_x": 0.1, "camera_rotation_y": -0.2, "camera_rotation_z": 0.3}
     world = World(camera_scale=1.02, camera_distortion=0.01, **angles)

@@ -120,22 +120,6 @@ def test_it_is_fine_tuned_on_the_emulated_robot(trained):
     np.testing.assert_allclose(make_policy("jit", loaded.policy).episode(observations), wanted, atol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("given", ["shipped", "renamed"])
-def test_another_networks_policy_is_no_start(trained, tmp_path, capsys, given):
-    source = ROOT / "experiments/shipped/policies/quickstart"
-    if given == "renamed":  # as many parameters
-        source = trained / "runs/mine"
-        (tmp_path / "my_task.py").write_text((trained / "my_task.py").read_text().replace('"gru"', '"other"'))
-        (tmp_path / "my_task.yaml").write_text((trained / "my_task.yaml").read_text().replace("gru", "other"))
-    place = tmp_path if given == "renamed" else trained
-    sets = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
-    sets += ["--set", f"initial_policy={source}", "--set", "name=other"]
-    assert cli.main(["train", str(place / "my_task.yaml"), "--out", str(tmp_path / "runs"), *sets]) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"initial_policy: {source}" in said and "network" in said
-
-
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import struct
 import zipfile
@@ -12,19 +11,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from rich.console import Console
 
-from experiments.deploy import play, robot_attachment
+from experiments.deploy import robot_attachment
 from experiments.errors import ConfigError
-from experiments.options import RIG, RobotOptions
-from experiments.view import measured, scene
-from experiments.view.viewer import robot_of
+from experiments.view import scene
 from mjx_tt.robot import robots
-from mjx_tt.sim.model import SimModel
-from robot_io import log
-from robot_io.contract import n_parameters
-from robot_io.policy import export
-from robot_io.policy.policy import Policy
 
 CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
@@ -106,31 +97,3 @@ def test_an_attachment_that_is_no_robot_is_refused(data, why, monkeypatch, tmp_p
     with pytest.raises(ConfigError, match=why):
         robot_attachment.unpack(data, "a.mcap")
     assert not (tmp_path / "outside").exists()
-
-
-@pytest.mark.realtime
-@pytest.mark.slow
-def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tmp_path):
-    robot = robots.load(folder)
-    n, seen = robot.contract.n_joints, robot.contract.n_observation
-    theta = 0.05 * np.random.default_rng(0).standard_normal(n_parameters(n))
-    config = {"balls": "narrow", "robot": robots.content(folder)}
-    export.write(
-        tmp_path / "artefact", Policy(theta, np.zeros(seen), np.ones(seen)), {"config": config}, robot=robot.contract
-    )
-    console = Console(record=True, width=200)
-    status = play.run(tmp_path / "artefact", RIG, tmp_path / "log", console, RobotOptions(backend="numpy"), 1)
-    assert status == 0, console.export_text()
-    contract, home = robot.contract, robot.home
-    shutil.rmtree(folder.parent)
-    shutil.rmtree(tmp_path / "artefact")
-    (path,) = (tmp_path / "log").glob("*.mcap")
-    replays = measured.load_session(path, SimModel())
-    shown = robot_of(replays)
-    assert shown.name == "mine" and shown.contract == contract and replays.count == 1
-    model, corners = drawn(shown)
-    assert corners == [4, 4] and model.nq == n
-    (replay,) = replays.replays(0)
-    np.testing.assert_allclose(replay.qpos[0], home, atol=0.05)
-    kept = json.loads(zipfile.ZipFile(io.BytesIO(log.read(path).attachments["robot.zip"])).read("robot.json"))
-    assert str(tmp_path) not in json.dumps(kept)  # nothing of where it was

@@ -46,13 +46,6 @@ def test_figures_come_with_their_intervals_and_conditions(artefact):
     assert artefact.digest in text and "not stated" in text and "license:" not in text
 
 
-def test_the_contract_is_the_artefacts(artefact):
-    text = write(artefact, artefact.manifest["provenance"]["evaluation"])
-    for part in artefact.manifest["contract"]["observation"][:3]:
-        assert row(text, part["name"]) == [part["unit"]]
-    assert "| joint_6 | rad/s | 10.47 |" in text and "75 times a second" in text
-
-
 def test_an_evaluation_after_fine_tuning_names_the_robot(artefact):
     after = {"return_rate": 0.5, "return_rate_low": 0.4, "return_rate_high": 0.6, "balls": 80, "mean_return": 1.0}
     text = write(artefact, {"after": after, "updates": 12, "robot": {"robot": "the rig", "balls": 3}})

@@ -81,30 +81,6 @@ def test_it_hits_and_returns_the_balls_that_the_simulator_does(policy, pool, mod
     assert np.abs(faults - counted).sum() <= 0.01 * counted.sum() + 1.0  # a gap of nothing may round to either side
 
 
-def test_its_observations_are_those_of_the_simulator(policy, pool):
-    drawn = episodes(pool)
-    simulator = Simulator(CONFIG)
-    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshape_episodes(drawn, -1))
-    wanted = jax.jit(simulator.rollout)(policy, drawn)
-    hit = np.asarray(wanted.outcome) != MISSED
-    ends = np.asarray(played.ends).reshape(R, P)
-    column = int(np.argmax(hit.sum(0)))
-    assert hit[:, column].sum() > 10
-    # Of one policy alone whose balls are all hit: the sums over what it saw until then.
-    seen = np.asarray(played.observations).reshape(TICKS, -1, R, P)[..., column]
-    rows = [seen[: ends[i, column], :, i] for i in range(R) if hit[i, column]]
-    alone = replace_columns(drawn, hit[:, column], column)
-    one = Policy(policy.theta[:, column : column + 1], policy.mean, policy.inv_std)
-    sums = jax.jit(simulator.rollout)(one, alone).observation_sums[0, :, 0]
-    np.testing.assert_allclose(
-        sum((row - np.asarray(policy.mean)).sum(0) for row in rows), np.asarray(sums), atol=0.02, rtol=1e-4
-    )
-
-
-def replace_columns(drawn, rows, column):
-    return jax.tree.map(lambda x: x[..., rows, column : column + 1] if x.ndim >= 2 else x, drawn)
-
-
 class Loops:
     """An engine whose joints are independent velocity loops, whose derivatives are then exact."""
 

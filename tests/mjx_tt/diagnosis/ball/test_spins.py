@@ -58,22 +58,6 @@ def _log(tmp_path, world, balls, rng):
     return load_logs([path])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.93, 0.89])
-def test_bounces_that_differ_from_ball_to_ball_are_no_cause_and_hide_none(tmp_path, restitution):
-    """The table's restitution and friction are drawn anew for every ball, which is not what the fit assumes of them."""
-    rng = np.random.default_rng(8)
-    balls, n = draw_balls(rng, 120), 120
-    world = World(restitution=restitution + rng.normal(0.0, 0.02, n), friction=0.25 * (1 + rng.normal(0.0, 0.15, n)))
-    found = diagnose(_log(tmp_path, world, balls, rng))
-    causes = {c.name: c for c in found.verdict.causes}
-    assert set(causes) == ({"table_restitution"} if restitution < 0.93 else set())
-    assert found.verdict.verdict == ("named" if causes else "none")
-    assert not found.verdict.unexplained
-    # The vertical kick, as the table gave it: restitution's spread times the speed of the impact.
-    assert found.balls.search.noise.scatter[2] == pytest.approx(0.02 * 3.0, rel=0.4)
-
-
 def _model(magnus_coefficient):
     nominal = SimModel()
     flight = replace(nominal.ball.flight, magnus_coefficient=magnus_coefficient)
