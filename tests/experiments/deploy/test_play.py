@@ -237,17 +237,14 @@ def until(session, condition):
         list(session.messages(0.02))
 
 
-def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeypatch):
-    """Again and again: the emergency stop, a reset that works, axes that do not get ready at once."""
+@pytest.fixture
+def on_the_simulated_clock(policy, monkeypatch):
+    """A simulated control process, and its session."""
     simulated = Simulated(policy, monkeypatch)
-    bridge, simulation = simulated.control.bridge, simulated.simulation
 
     def control():
         with simulated.control:
             simulated.control.run()
-
-    def press(pressed):
-        simulated.script.append((0.0, lambda: bridge.gate.estop(pressed, simulation.now)))
 
     thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
@@ -255,29 +252,40 @@ def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeyp
     thread.start()
     with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
         until(session, lambda status: not status.missing and not status.present)
-        session.arm()
-        for _ in range(3):
-            press(True)
-            until(session, lambda status: status.state == "fault")
-            with pytest.raises(RefusedError, match="cannot reset while a cause is present: ESTOP"):
-                session.reset()
-            press(False)
-            until(session, lambda status: not status.present)
-            session.reset()
-            assert session.status.state == "disarmed"
-            monkeypatch.setattr(simulation.axes, "problem", lambda _: "gantry_x is switched off")
-            for _ in range(2):
-                with pytest.raises(RefusedError, match="not armed: axes: gantry_x is switched off"):
-                    session.arm()
-                session.reset()  # no fault is left: nothing to do, and no refusal
-            monkeypatch.setattr(simulation.axes, "problem", lambda _: None)
-            session.recover(SimpleNamespace(switch_on=lambda: None))
-            assert session.status.state == "ready" and session.status.at_home and not session.status.faults
+        yield simulated, session
     assert not thread.is_alive()
 
 
-def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(policy, monkeypatch):
-    simulated = Simulated(policy, monkeypatch)
+def test_arming_that_is_refused_after_a_reset_can_be_tried_again(on_the_simulated_clock, monkeypatch):
+    """Again and again: the emergency stop, a reset that works, axes that do not get ready at once."""
+    simulated, session = on_the_simulated_clock
+    bridge, simulation = simulated.control.bridge, simulated.simulation
+
+    def press(pressed):
+        simulated.script.append((0.0, lambda: bridge.gate.estop(pressed, simulation.now)))
+
+    session.arm()
+    for _ in range(3):
+        press(True)
+        until(session, lambda status: status.state == "fault")
+        with pytest.raises(RefusedError, match="cannot reset while a cause is present: ESTOP"):
+            session.reset()
+        press(False)
+        until(session, lambda status: not status.present)
+        session.reset()
+        assert session.status.state == "disarmed"
+        monkeypatch.setattr(simulation.axes, "problem", lambda _: "gantry_x is switched off")
+        for _ in range(2):
+            with pytest.raises(RefusedError, match="not armed: axes: gantry_x is switched off"):
+                session.arm()
+            session.reset()  # no fault is left: nothing to do, and no refusal
+        monkeypatch.setattr(simulation.axes, "problem", lambda _: None)
+        session.recover(SimpleNamespace(switch_on=lambda: None))
+        assert session.status.state == "ready" and session.status.at_home and not session.status.faults
+
+
+def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(on_the_simulated_clock, monkeypatch):
+    simulated, session = on_the_simulated_clock
     arm, jogged = simulated.control.bridge.arm, []
 
     def arm_there(now):
@@ -285,19 +293,9 @@ def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(policy, monkey
             raise JogFirstError("not armed: not from here")
         arm(now)
 
-    def control():
-        with simulated.control:
-            simulated.control.run()
-
-    thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(simulated.control.bridge, "arm", arm_there)
-    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
-    monkeypatch.setattr(sessions, "SETTLE", 0.0)
-    thread.start()
-    with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
-        until(session, lambda status: not status.missing and not status.present)
-        session.recover(SimpleNamespace(switch_on=lambda: None, jog=lambda: jogged.append(True)))
-        assert len(jogged) == 1 and session.status.state == "ready"
+    session.recover(SimpleNamespace(switch_on=lambda: None, jog=lambda: jogged.append(True)))
+    assert len(jogged) == 1 and session.status.state == "ready"
 
 
 @pytest.fixture
@@ -372,29 +370,13 @@ def test_a_session_that_nobody_listens_to_is_stopped(playing):
 
 
 @pytest.mark.realtime
-def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
+@pytest.mark.parametrize("causes", [("arm_not_ready",), ("axis_lost", "stale_axes")], ids=["emergency stop", "cable"])
+def test_what_stops_the_robot_is_a_latched_fault_and_can_be_mended(playing, causes):
+    """Of a pulled cable both are silence: whichever is noticed first."""
     rig, session, _ = playing
-    rig.motors_off()
-    end = time.monotonic() + 5
-    while time.monotonic() < end and not (session.status and session.status.faults):
-        list(session.messages(0.1))
-    assert session.status.state == "fault"
-    assert "motors are off" in session.status.faults[0].text or session.status.faults[0].cause == "arm_not_ready"
-    with pytest.raises(RefusedError, match="cannot reset"):
-        session.reset()
-    session.recover(rig)
-    assert session.status.state in ("ready", "active") and not session.status.faults
-
-
-@pytest.mark.realtime
-def test_pulled_cable_of_an_axis_is_a_latched_fault_and_can_be_mended(playing):
-    rig, session, _ = playing
-    rig.connect_axis(0, False)
-    end = time.monotonic() + 5
-    while not any(fault.cause == "axis_lost" for fault in session.status.faults):
-        assert time.monotonic() < end
-        list(session.messages(0.1))
-    assert session.status.faults[0].cause in ("axis_lost", "stale_axes")  # it is silence: whichever is noticed first
+    rig.connect_axis(0, False) if "axis_lost" in causes else rig.motors_off()
+    until(session, lambda status: any(fault.cause in causes for fault in status.faults))
+    assert session.status.state == "fault" and session.status.faults[0].cause in causes
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
     rig.connect_axis(0, True)

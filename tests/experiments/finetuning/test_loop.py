@@ -112,6 +112,13 @@ def last_theta(folder: Path) -> np.ndarray:
     return checkpoint.read_latest(folder / "checkpoints")[0]["bgs.theta"]
 
 
+@pytest.fixture(scope="module")
+def whole(source, tmp_path_factory) -> Path:
+    """A run that nothing disturbed."""
+    tune(source, folder := tmp_path_factory.mktemp("runs") / "whole", Toy())
+    return folder
+
+
 # Settings and rewards
 
 
@@ -314,15 +321,14 @@ class Failing(Toy):
 
 
 @pytest.mark.parametrize("after", [0, 4, 9, 16])
-def test_no_more_than_the_episode_in_play_is_lost(source, tmp_path, after):
-    tune(source, tmp_path / "whole", Toy())
+def test_no_more_than_the_episode_in_play_is_lost(source, whole, tmp_path, after):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "cut", Failing(after))
     assert len(entries(tmp_path / "cut")) == after
     rest = Toy()
     tune(source, tmp_path / "cut", rest)
     assert len(rest.played) == 3 * 12 + 2 * 4 - after
-    np.testing.assert_array_equal(last_theta(tmp_path / "cut"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "cut"), last_theta(whole))
     assert len(metrics.read(tmp_path / "cut" / "metrics.jsonl")) == 3
 
 
@@ -337,7 +343,7 @@ def test_it_continues_from_the_journal_when_checkpoints_are_gone(source, tmp_pat
     np.testing.assert_array_equal(last_theta(tmp_path / "run"), theta)
 
 
-def test_half_a_line_is_dropped_and_its_episode_played_again(source, tmp_path):
+def test_half_a_line_is_dropped_and_its_episode_played_again(source, whole, tmp_path):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "run", Failing(8))
     path = tmp_path / "run" / loop.JOURNAL
@@ -346,8 +352,7 @@ def test_half_a_line_is_dropped_and_its_episode_played_again(source, tmp_path):
         path.write_bytes(content[:-cut])
         assert len(entries(tmp_path / "run")) == 7
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    assert path.read_bytes() == (tmp_path / "whole" / loop.JOURNAL).read_bytes()
+    assert path.read_bytes() == (whole / loop.JOURNAL).read_bytes()
 
 
 def test_a_journal_that_was_changed_is_refused(source, tmp_path):
@@ -370,15 +375,14 @@ def test_a_journal_that_was_changed_is_refused(source, tmp_path):
             Journal(path)
 
 
-def test_a_journal_from_before_there_were_checksums_goes_on(source, tmp_path):
+def test_a_journal_from_before_there_were_checksums_goes_on(source, whole, tmp_path):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "run", Failing(8))
     path = tmp_path / "run" / loop.JOURNAL
     old = re.sub(rb', "checksum": "[0-9a-f]+"', b"", path.read_bytes())
     path.write_bytes(old)
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    assert len(entries(tmp_path / "run")) == len(entries(tmp_path / "whole"))
+    assert len(entries(tmp_path / "run")) == len(entries(whole))
     path.write_bytes(path.read_bytes().replace(b'"discarded": false', b'"discarded": true', 1))
     with pytest.raises(RunError, match=f"line {len(old.splitlines()) + 1} was changed, or lines before it"):
         Journal(path)
@@ -392,7 +396,7 @@ def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):
         tune(source, tmp_path / "run", Toy(), updates=1)
 
 
-def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, tmp_path):
+def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, whole, tmp_path):
     class Absent(Toy):
         def play(self, *arguments) -> PlayedBall:
             raise RunError("no robot answers")
@@ -400,17 +404,15 @@ def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(sour
     with pytest.raises(RunError, match="no robot answers"):
         tune(source, tmp_path / "run", Absent(), sigma=0.05)
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
     assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["sigma"] == 0.025
 
 
-def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path):
-    tune(source, tmp_path / "whole", Toy())
+def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, whole, tmp_path):
     tune(source, tmp_path / "run", Toy(), updates=2)
     report = tune(source, tmp_path / "run", Toy())
     assert report["updates"] == 3 and report["after"]["balls"] == 4 and report["difference"]["paired"]
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
 
 
 # The operator
@@ -482,14 +484,13 @@ def test_what_the_bridge_discards_or_the_operators_stop_ends_does_not_count(sour
     assert [entry.summary.fault for entry in kept if entry.summary.fault] == ["clearance", "arm_not_ready"]
 
 
-def test_stop_and_continue_and_pause(source, tmp_path):
-    tune(source, tmp_path / "whole", Toy())
+def test_stop_and_continue_and_pause(source, whole, tmp_path):
     assert tune(source, tmp_path / "run", Toy(), Person(stop_after=11)) is None
     assert len(entries(tmp_path / "run")) == 11
     person = Person(looks=3)
     assert tune(source, tmp_path / "run", Toy(), person) is not None
     assert person.looks < 0
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
 
 
 # Measurements

@@ -13,14 +13,11 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
-from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis as gap
 from mjx_tt.diagnosis.ball import effects as catalogue
 from mjx_tt.diagnosis.ball.spins import Spins
 from mjx_tt.diagnosis.hits.diagnose import HitCause, HitFindings
-from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.joint.effects import NAMES
 from mjx_tt.diagnosis.logs import Logs
@@ -29,6 +26,10 @@ from mjx_tt.diagnosis.report import page as report
 from mjx_tt.diagnosis.report import text as words
 from mjx_tt.diagnosis.verdict import Unexplained
 from mjx_tt.sim import model
+from tests.exam.generator import robot
+from tests.exam.generator.world import World
+from tests.mjx_tt.diagnosis.test_tracks import flights
+from tests.mjx_tt.diagnosis.together.test_joints import logged
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.optimised
@@ -44,60 +45,17 @@ WIND = 0.35  # [m/s] towards -x
 VOID = {"meta", "link", "br", "img", "hr", "wbr", "input"}
 
 
-def flights(wind: float, balls: int = 60, noise: float = 0.002, seed: int = 1) -> tuple[Trajectory, ...]:
-    """Balls of the paper's model (no spin) in moving air, by plain Euler steps of 0.25 ms; one bounce each."""
-    rng = np.random.default_rng(seed)
-    drag, dt = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027), 2.5e-4
-    x = rng.uniform([-0.5, 1.2, 0.25], [0.5, 1.5, 0.45], (balls, 3))
-    v = rng.uniform([-0.6, -5.6, 0.6], [0.6, -4.2, 1.6], (balls, 3))
-    path = []
-    for step in range(int(0.6 / dt)):
-        if step % 32 == 0:
-            path.append(x.copy())
-        u = v - [wind, 0.0, 0.0]
-        a = [0.0, 0.0, -9.81] - drag * np.linalg.norm(u, axis=1, keepdims=True) * u
-        x, v = x + dt * (v + 0.5 * dt * a), v + dt * a
-        low = (x[:, 2] < 0.02) & (v[:, 2] < 0.0) & (np.abs(x[:, 0]) < 0.7625) & (np.abs(x[:, 1]) < 1.37)
-        for i in np.flatnonzero(low):
-            # Back to the surface, Coulomb friction against the contact point's slip, then up again.
-            back = (x[i, 2] - 0.02) / v[i, 2]
-            x[i] -= back * v[i]
-            slip = v[i, :2].copy()
-            most = 0.25 * 1.93 * -v[i, 2]
-            v[i, :2] -= slip * min(most / np.linalg.norm(slip), 0.4)
-            v[i, 2] *= -0.93
-            x[i] += back * v[i]
-    places = np.array(path).transpose(1, 2, 0) + rng.normal(0.0, noise, (balls, 3, len(path)))
-    time = 0.008 * np.arange(len(path))
-    return tuple(Trajectory(f"day{i % 3}", str(i), time, p) for i, p in enumerate(places))
-
-
 @pytest.fixture(scope="module")
 def windy() -> gap.Diagnosis:
-    return gap.diagnose(Logs(flights(-WIND), (), {"windy.csv": "ab" * 32}))
+    return gap.diagnose(Logs(flights(60, 1, world=World(wind_x=-WIND)), (), {"windy.csv": "ab" * 32}))
 
 
 @pytest.fixture(scope="module")
 def joints() -> gap.Diagnosis:
-    """Two joints, one of which answers 60 ms late on top of what is known."""
-    rng = np.random.default_rng(4)
-    records = []
-    for name, delay, lag, servo in (("gantry_x", 0.0645, 0.033, 0.02), ("joint_2", 0.071 + 0.06, 0.029, 0.008)):
-        time = np.arange(0.0, 20.0, 0.1)
-        velocity = rng.uniform(-0.6, 0.6, time.size) * (rng.random(time.size) < 0.6)
-        state = np.arange(0.0, 20.0, 0.01)
-        # A delayed, held command integrated on a fine grid and followed by a servo, whose numbers robot.xml tells.
-        step = 1e-4
-        fine = np.arange(-0.3, 20.0, step)
-        held = np.where(
-            fine - delay - lag >= 0.0,
-            velocity[np.clip(((fine - delay - lag) / 0.1).astype(int), 0, time.size - 1)],
-            0.0,
-        )
-        share = -np.expm1(-step / servo)
-        followed = lfilter([0.9952 * share], [1.0, share - 1.0], np.cumsum(held) * step)
-        position = np.interp(state, fine + step, followed) + rng.normal(0.0, 1e-4, state.size)
-        records.append(JointRecord(name, time, velocity, state, position))
+    """Joints of which one answers 60 ms late on top of what is known."""
+    true = {name: robot.nominal(name) for name in robot.JOINTS}
+    true["joint_2"] = replace(true["joint_2"], action_delay=0.131)
+    records = logged(true, np.random.default_rng(4), 20.0)
     return gap.diagnose(Logs((), tuple(records), {"command.csv": "12" * 32, "state.csv": "34" * 32}))
 
 
@@ -213,7 +171,8 @@ def test_joints_are_named_and_drawn(joints, tmp_path):
 def test_nothing_wrong_says_what_would_have_been_seen(tmp_path):
     """The windy balls against a model that knows the wind: nothing is left to name."""
     path = "ball.flight.wind_x"
-    right = gap.diagnose(Logs(flights(-WIND), (), {}), model.with_values(model.SimModel(), {path: -WIND}))
+    balls = flights(60, 1, world=World(wind_x=-WIND))
+    right = gap.diagnose(Logs(balls, (), {}), model.with_values(model.SimModel(), {path: -WIND}))
     assert right.verdict.verdict == "none" and "agrees with 60 balls" in words.sentence(right)
     page, _ = written(tmp_path, right)
     assert "table_restitution" in page.sections["Verdict"]

@@ -20,10 +20,10 @@ WORLD = World()
 
 
 @cache
-def flights(n: int = 24, seed: int = 0, noise: str = "iid") -> tuple[Trajectory, ...]:
+def flights(n: int = 24, seed: int = 0, noise: str = "iid", world: World = WORLD) -> tuple[Trajectory, ...]:
     """Strokes of people and returns, one bounce each, with 3 mm of noise."""
     rng = np.random.default_rng(seed)
-    log = measure(WORLD, draw_balls(rng, n), noise, rng)
+    log = measure(world, draw_balls(rng, n), noise, rng)
     out = []
     for i in range(n):
         seen = np.isfinite(log.position[0, :, i])
