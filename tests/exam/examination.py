@@ -30,15 +30,12 @@ from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import Workers
 from experiments.options import load_site
 from tests.exam.generator import cases as drawing
-from tests.exam.generator import held_out, human_strokes, scoring
-from tests.exam.generator.cases import BallCase, Case
+from tests.exam.generator import human_strokes, scoring
+from tests.exam.generator.cases import Case
 from tests.exam.generator.json_lines import append, read_lines
-from tests.exam.generator.sessions import draw_balls, measure
 from tests.exam.generator.write import write
 
-FRESH = 100  # balls of the held-out test, which no diagnosis sees
-GAINED = ("none", "noise", "single", "pair", "triple", "many")  # kinds whose true model is a model
-# Kinds and sizes of each bar, and their share of --cases. Bars 6 and 9 are read off the others.
+# Kinds and sizes of each bar, and their share of --cases. Bar 6 is read off the others.
 BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "1": (("none", None, 1.0), ("noise", None, 0.5)),
     "2": (("single", 10.0, 1.0),),
@@ -48,7 +45,6 @@ BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "6": (("single", 10.0, 1.0),),
     "7": (("deleted", None, 1.0),),
     "8": (("invented", None, 1.0),),
-    "9": (("none", None, 1.0), ("single", 10.0, 1.0), ("pair", None, 1.0)),
     "10": (("robot", None, 1.0), ("unexcited", None, 0.25), ("robot_none", None, 0.25)),
     "13": (("human_none", None, 1.0),),
     "14": (("human_single", 10.0, 1.0), ("human_single", 20.0, 1.0)),
@@ -98,8 +94,7 @@ ROBOT_KINDS = ("robot", "unexcited", "robot_none")
 
 def examine(case: Case, folder: Path) -> dict:
     """Draws, writes, diagnoses and scores one case."""
-    began = time.perf_counter()
-    files, sealed, drawn = write(case, folder)
+    files, sealed, _ = write(case, folder)
     record: dict = {"key": case.name, "case": asdict(case)}
     started, worked = time.perf_counter(), time.process_time()
     try:
@@ -118,24 +113,7 @@ def examine(case: Case, folder: Path) -> dict:
     truth = json.loads(sealed.read_text())
     record |= scoring.score(truth, verdict)
     record |= {"twins": truth["twins"], "amounts": truth["amounts"]}
-    if isinstance(drawn, BallCase) and case.kind in GAINED:
-        record["gain"] = gain(drawn, folder / "out" / "extended.yaml")
-    record["all_seconds"] = time.perf_counter() - began
     return record
-
-
-def gain(drawn: BallCase, extended: Path) -> dict[str, float]:
-    """Held-out error [mm] of the nominal, the true and the diagnosed model on fresh balls of the same world."""
-    rng = np.random.default_rng([drawn.case.seed, 1])
-    balls = draw_balls(rng, FRESH)
-    fresh = drawing.build(drawn.case, balls)
-    log = measure(fresh.world, fresh.balls, "iid", rng)
-    models = {
-        "nominal": held_out.nominal(),
-        "true": held_out.Model(drawn.world, drawn.spin_mean, drawn.spin_std),
-        "extended": held_out.load(extended) if extended.exists() else held_out.nominal(),
-    }
-    return held_out.compare(models, log, fresh.balls)
 
 
 def summarise(records: list[dict], folder: Path) -> str:

@@ -17,11 +17,11 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from tests.exam import examination
-from tests.exam.generator import cases, held_out, human_strokes, robot, scoring
+from tests.exam.generator import cases, human_strokes, robot, scoring
 from tests.exam.generator.cases import EFFECTS, Case
 from tests.exam.generator.invented_defects import INVENTED
 from tests.exam.generator.json_lines import append, read_lines
-from tests.exam.generator.sessions import INTERVAL, SIGMA, draw_balls, measure, shift, with_spin
+from tests.exam.generator.sessions import INTERVAL, SIGMA, draw_balls, measure, shift
 from tests.exam.generator.world import World, camera, fly, seen
 from tests.exam.generator.write import write
 from tests.support.paths import ROOT
@@ -264,42 +264,7 @@ def test_a_robot_case_changes_one_joint_only():
     assert min(v for _, n, v in gentle if n == "joint_2") >= 0.0  # it never reverses
 
 
-# --- held-out prediction, baselines, scoring --------------------------------------------------------------------------
-
-
-def test_the_true_model_predicts_down_to_the_noise():
-    case = Case("single", ("drag_coefficient",), 20.0, "iid", 3, count=80)
-    drawn = cases.build(case)
-    log = drawn.log()
-    clean = replace(log, position=log.clean)
-    true = held_out.Model(drawn.world, drawn.spin_mean, drawn.spin_std)
-    assert np.nanmax(held_out.errors(true, clean, drawn.balls.human)) < 1e-5
-    assert np.nanmedian(held_out.errors(held_out.nominal(), clean, drawn.balls.human)) > 5e-3
-
-
-def test_known_spins_help_as_far_as_their_prior_does():
-    rng = np.random.default_rng(4)
-    balls = draw_balls(rng, 60)
-    topspin = np.where(balls.human, 60.0, -60.0) * np.array([[1.0], [0.0], [0.0]])
-    world = World(magnus_coefficient=0.6)
-    log = measure(world, with_spin(balls, topspin), "iid", rng)
-    clean = replace(log, position=log.clean)
-    mean = np.array([60.0, 0.0, 0.0])
-    assert np.nanmax(held_out.errors(held_out.Model(world, mean, np.zeros(3)), clean, balls.human)) < 1e-5
-    fitted = held_out.errors(held_out.Model(world, 0 * mean, np.full(3, 1e4)), clean, balls.human)
-    assert np.nanmedian(fitted) < 1e-3  # without noise even the early part tells the spin
-
-
-def test_an_extended_model_is_read_by_its_paths(tmp_path):
-    path = tmp_path / "extended.yaml"
-    path.write_text(
-        "ball: {flight: {wind_x: 0.2, integrator: midpoint}, table: {restitution: 0.9, tilt_x: 0.01}}\n"
-        "sensing: {clock_rate: 1.01, ball_noise: 0.04}\nball_spin: {mean_x: 5.0, std_y: 2.0}\n"
-        "latency: {abb_action: 0.1}\n"
-    )
-    model = held_out.load(path)
-    assert model.world == World(wind_x=0.2, restitution=0.9, tilt_x=0.01, clock_rate=1.01)
-    assert model.spin_mean.tolist() == [5, 0, 0] and model.spin_std.tolist() == [0, 2, 0]
+# --- scoring ---------------------------------------------------------------------------------------------------------
 
 
 def verdict(*groups, **rest):

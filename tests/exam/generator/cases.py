@@ -222,11 +222,8 @@ def _generator(case: Case, use: str) -> np.random.Generator:
     return np.random.default_rng([case.seed, zlib.crc32(use.encode())])
 
 
-def build(case: Case, balls: Balls | None = None) -> BallCase:
-    """Draws the balls of a ball case and scales its causes, each alone, to the case's size.
-
-    balls: other balls in the same world (for held-out tests); the amounts stay those of the case's own balls.
-    """
+def build(case: Case) -> BallCase:
+    """Draws the balls of a ball case and scales its causes, each alone, to the case's size."""
     own = draw_balls(_generator(case, "balls"), case.count)
     target = 1e-3 * case.size_mm
     few = own.take(np.sort(_generator(case, "few").permutation(len(own))[:SCALING_BALLS]))
@@ -241,9 +238,7 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
         else:
             amounts[cause] = sign * _scaled(case, cause, sign, few, target)
     world = World(magnus_coefficient=MAGNUS) if case.human else World()
-    if balls is None:
-        balls = draw_human(_generator(case, "people"), case.count, world) if case.human else own
-    spinning = balls
+    spinning = draw_human(_generator(case, "people"), case.count, world) if case.human else own
     mean, std = np.zeros(3), np.zeros(3)
     for cause, amount in amounts.items():
         world, spinning = _apply(case, cause, amount, world, spinning)

@@ -239,7 +239,6 @@ def table(records: list[dict]) -> list[Row]:
         _share("7", "true cause deleted: a twin or look-alike named", "-", ended("deleted", right)),
         _share("8", "never in the catalogue: flagged", ">= 90 %", ended("invented", flagged)),
         _share("8", "never in the catalogue: wrong name", "<= 10 %", ended("invented", wrong)),
-        *_gain_rows(records),
         _share("10", "robot, one effect: right", ">= 95 %", ended("robot", right)),
         _share("10", "robot, one effect: wrong name", "-", ended("robot", wrong)),
         _share("10", "robot, delay within 2 ms", ">= 100 %", delays),
@@ -289,26 +288,6 @@ def _median_interval(values: list[float], level: float = 0.95) -> tuple[float, f
     return float(ordered[max(k - 1, 0)]), float(ordered[min(len(values) - k, len(values) - 1)])
 
 
-def _gain_rows(records: list[dict]) -> list[Row]:
-    """Gain of the written model over that of the true one, summed over cases, and what "none" changes."""
-    gains = [r["gain"] for r in records if r.get("gain") and r["case"]["kind"] in ("single", "pair", "triple")]
-    useful = [g for g in gains if g["nominal"] - g["true"] > 0.1]
-    share = low = high = math.nan
-    if useful:
-        possible = np.array([g["nominal"] - g["true"] for g in useful])
-        reached = np.array([g["nominal"] - g["extended"] for g in useful])
-        pick = np.random.default_rng(0).integers(0, len(useful), (2000, len(useful)))
-        share = float(reached.sum() / possible.sum())
-        low, high = map(float, np.quantile(reached[pick].sum(1) / possible[pick].sum(1), [0.025, 0.975]))
-    met = share >= 0.9 if useful else None
-    quiet = [r["gain"] for r in records if r.get("gain") and r["case"]["kind"] in ("none", "noise")]
-    kept = [abs(g["extended"] / g["nominal"] - 1) <= 0.01 for g in quiet]
-    return [
-        Row("9", "held-out gain over the true model's", ">= 90 %", len(useful), share, low, high, met),
-        _share("9", "nothing wrong: error changed by at most 1 %", ">= 100 %", kept),
-    ]
-
-
 def _many_rows(records: list[dict]) -> list[Row]:
     covered = []
     for r in records:
@@ -316,26 +295,9 @@ def _many_rows(records: list[dict]) -> list[Row]:
             # A cause and its twins are one number.
             found = [r["parameters"][p] for p in EFFECTS[cause].truth(0.01) if p in r.get("parameters", {})]
             covered += [bool(p["covered"]) for p in found[:1] if p["covered"] is not None]
-    shares = [
-        (g["nominal"] - g["extended"]) / (g["nominal"] - g["true"])
-        for g in (r["gain"] for r in records if r.get("gain"))
-        if g["nominal"] - g["true"] > 0.1
-    ]
-    low, high = _median_interval(shares)
-    median = float(np.median(shares)) if shares else math.nan
     return [
         _share("17", "2 to 8 ordinary causes: wrong name", "<= 2 %", [r["outcome"] == "wrong" for r in records]),
         _share("17", "2 to 8 ordinary causes: 90 % intervals that cover", "85-95 %", covered),
-        Row(
-            "17",
-            "2 to 8 ordinary causes: gain over the true model's, median",
-            ">= 90 %",
-            len(shares),
-            median,
-            low,
-            high,
-            median >= 0.9 if shares else None,
-        ),
     ]
 
 

@@ -11,7 +11,7 @@ ball to ball (session, time in session, a rare subset) is a world whose number i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -59,16 +59,6 @@ class World:
     surface: Callable | None = None  # (x, y) -> height added to the table and its slopes, three arrays
     restitution_map: Callable | None = None  # (x, y) -> added to e
     camera_shift: Callable | None = None  # (position) -> added to the measured position (3, ...)
-
-    def take(self, index: np.ndarray) -> World:
-        """The world of the balls ``index``."""
-        changed = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{k: v[index] for k, v in changed.items() if isinstance(v, np.ndarray)})
-
-    def tiled(self, times: int) -> World:
-        """The world of the balls repeated ``times`` over, for one run of many variations."""
-        changed = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{k: np.tile(v, times) for k, v in changed.items() if isinstance(v, np.ndarray)})
 
 
 def _cross(a, b):
