@@ -28,7 +28,7 @@ from experiments.options import RIG, RobotOptions
 from robot_io import contract, log
 from robot_io.control import process
 from robot_io.control.config import RobotConfig
-from robot_io.emulator.processes import free_ports
+from robot_io.emulator.processes import Rig, free_ports
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
@@ -370,15 +370,23 @@ def test_a_session_that_nobody_listens_to_is_stopped(playing):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("causes", [("arm_not_ready",), ("axis_lost", "stale_axes")], ids=["emergency stop", "cable"])
-def test_what_stops_the_robot_is_a_latched_fault_and_can_be_mended(playing, causes):
-    """Of a pulled cable both are silence: whichever is noticed first."""
+@pytest.mark.parametrize(
+    "breaks, causes",
+    [
+        (Rig.motors_off, ["arm_not_ready"]),
+        (lambda rig: rig.connect_arm(False), ["stale_arm"]),
+        (lambda rig: rig.connect_axis(0, False), ["axis_lost", "stale_axes"]),  # whichever is noticed first
+    ],
+    ids=["emergency stop", "the arm's cable", "an axis's cable"],
+)
+def test_what_stops_the_robot_is_a_latched_fault_and_can_be_mended(playing, breaks, causes):
     rig, session, _ = playing
-    rig.connect_axis(0, False) if "axis_lost" in causes else rig.motors_off()
+    breaks(rig)
     until(session, lambda status: any(fault.cause in causes for fault in status.faults))
-    assert session.status.state == "fault" and session.status.faults[0].cause in causes
+    assert session.status.state == "fault"
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
+    rig.connect_arm(True)
     rig.connect_axis(0, True)
     session.recover(rig)
     assert session.status.state in ("ready", "active") and not session.status.faults
