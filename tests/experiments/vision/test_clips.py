@@ -6,9 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from experiments.errors import ConfigError
 from experiments.vision import clips
-from robot_io.vision.recording import FrameWriter
 
 FORMS = {
     "own.csv": "frame,x,y\n0,10.5,20\n2,,\n3,7,8\n",
@@ -41,14 +39,3 @@ def test_a_video_gives_bayer_frames(tmp_path):
     assert clip.rate == 50 and len(frames) == 4 and frames[0].shape == (50, 70)
     levels = [frames[1][row::2, column::2].mean() for row, column in ((0, 0), (0, 1), (1, 0), (1, 1))]
     np.testing.assert_allclose(levels, (200, 100, 100, 30), atol=6)
-
-
-def test_a_recording_needs_the_name_of_one_of_its_cameras(tmp_path):
-    path = tmp_path / "a.mcap"
-    with FrameWriter(path, {"left": (16, 8), "right": (16, 8)}, 100.0) as writer:
-        for k, name in enumerate(("left", "right", "right")):
-            writer.write(name, k / 100, np.full((8, 16), k, np.uint8))
-    with pytest.raises(ConfigError, match="left, right"):
-        clips.open_clip(path)
-    clip = clips.open_clip(path, "right")
-    assert clip.rate == 100.0 and [f.max() for f in clip.frames()] == [1, 2]

@@ -281,13 +281,3 @@ def test_ball_noise_is_two_diameters_wide_and_the_joints_have_none(flailing):
     assert (np.abs(noise) < 0.04).all()
     assert stats.kstest(noise.ravel(), "uniform", (-0.04, 0.08)).pvalue > 1e-3
     np.testing.assert_allclose(seen[:, 3:], np.broadcast_to(task().home[:, None], (TICKS, N_JOINTS, P)), atol=1e-12)
-
-
-def test_where_the_paddle_is_hit_does_not_depend_on_the_simulation_rate(serves, record):
-    """One step per control period, in which a ball moves up to 16 cm, against four."""
-    with jax.enable_x64(True):
-        other = play(task(sim_rate=75.0), batch(serves))
-    np.testing.assert_array_equal(other.last.hit, record.last.hit)
-    np.testing.assert_array_equal(other.back.returned, record.back.returned)
-    returned = [i for i, name in enumerate(serves) if name.startswith("returned")]
-    np.testing.assert_allclose(other.back.landing[:, returned], record.back.landing[:, returned], rtol=0, atol=1e-3)
