@@ -21,8 +21,11 @@ def test_the_view_shows_state_faults_joints_and_counts():
     console = Console(record=True, width=300, file=StringIO())
     fault, joints = messages.FaultReport("estop", "the button is pressed"), [("rail", "m", 0.1, 0.0)]
     status = messages.Status(1.0, "fault", True, False, (fault,), {}, None, None, None, joints)
-    counts = {"balls": 3, "outcomes": {"returned": 2, "missed": 1}, "axes_cycles": 17, "axes_late": 4}
-    status = replace(status, **counts, ball=(0.1, -0.2, 0.02), dry=True, stopped="not heard for 2 s")
+    status = replace(status, balls=3, outcomes={"returned": 2, "missed": 1}, axes_cycles=17, axes_late=4)
+    status = replace(
+        status, egm={"accepted": 1000, "rejected": {"stranger": 2}, "lost": 3}, tracker_counts={"accepted": 40}
+    )
+    status = replace(status, ball=(0.1, -0.2, 0.02), dry=True, stopped="not heard for 2 s")
     with view:
         view.take(messages.Refused(messages.Arm(), RefusedError("not now")))
         view.take(status)
@@ -35,6 +38,7 @@ def test_the_view_shows_state_faults_joints_and_counts():
         "STOPPED: not heard for 2 s",
         "balls 3: 2 returned, 1 missed",
         "+0.100 m ",
+        "EGM 1,000 taken, 2 refused, 3 lost; tracker 40 taken",
         "17 cycles, 4 late",
         "not now",
         *(key.text for key in KEYS.values()),
