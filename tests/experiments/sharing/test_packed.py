@@ -88,25 +88,17 @@ def test_the_cards_code_runs_with_numpy_alone(file, tmp_path):
 
 def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     """At random places of every member, and of all that is not a member: headers and directory."""
-    raw, random = file.read_bytes(), np.random.default_rng(0)
+    raw, random, damaged = file.read_bytes(), np.random.default_rng(0), tmp_path / "damaged.zip"
+    outside = np.ones(len(raw), bool)
     with zipfile.ZipFile(file) as archive:
-        spans = {i.filename: (i.header_offset + 30 + len(i.filename), i.file_size) for i in archive.infolist()}
-    inside = np.zeros(len(raw), bool)
-    for start, size in spans.values():
-        inside[start : start + size] = True
-    flips = [(8 * int(byte) + bit, "") for byte in np.flatnonzero(~inside)[::3] for bit in random.integers(0, 8, 1)]
-    flips += [(8 * start + int(b), n) for n, (start, size) in spans.items() for b in random.integers(0, 8 * size, 20)]
-    damaged = tmp_path / "damaged.zip"
-    unnamed = 0
-    for bit, name in flips:
+        for i in archive.infolist():
+            outside[i.header_offset + 30 + len(i.filename) :][: i.file_size] = False
+    for byte in np.r_[np.flatnonzero(outside)[::3], random.integers(0, len(raw), 200)]:
         content = bytearray(raw)
-        content[bit // 8] ^= 1 << bit % 8
+        content[byte] ^= 1 << int(random.integers(0, 8))
         damaged.write_bytes(content)
-        with pytest.raises(PackError, match="copy the file again") as refused:
+        with pytest.raises(PackError, match="damaged.zip: .*copy the file again"):
             read(damaged)
-        assert str(damaged) in str(refused.value) and name in str(refused.value), (bit, name)
-        unnamed += not any(member in str(refused.value) for member in (*MEMBERS, "table of contents"))
-    assert unnamed == 0 and len(flips) > 500
 
 
 def crafted(path, changes=(), leave=(), compression=zipfile.ZIP_STORED):
