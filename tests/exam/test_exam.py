@@ -376,11 +376,6 @@ FIXED = [
         marks=SLOW,
     ),
     pytest.param(Case("human_none", (), 0.0, "ar1", 31, count=200), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(
-        Case("human_pair", ("drag_coefficient", "table_tilt_x"), 20.0, "ar1", 34, count=200),
-        ("right",),
-        marks=[SLOW, PEOPLE],
-    ),
     # It changes drag and lift alike: one cause, not two.
     pytest.param(Case("human_single", ("ball_mass",), 20.0, "iid", 35, count=200), ("right",), marks=[SLOW, PEOPLE]),
     # What its filter leaves along a flight is no finding; a wind beside it still is.

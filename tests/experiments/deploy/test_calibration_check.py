@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from rich.console import Console
 
 from experiments.config import robot as robots
+from experiments.config.finetuning import FineTuning
 from experiments.deploy import calibration_check, play
 from experiments.deploy.control_session import load_installed
 from experiments.errors import ConfigError
+from experiments.finetuning import on_robot as tuning
+from experiments.options import ROBOT
 from experiments.runs import run_dir
+from mjx_tt.robot.robots import paper
 from robot_io.calibration import contacts
 from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
@@ -75,6 +80,20 @@ def test_a_session_keeps_its_summary_whatever_its_contacts_tell(tmp_path, monkey
     else:
         assert written["contacts"] == {"count": 3, "lag": None, "lag_deviation": None, "spread": None}
     calibration_check.check(config(), "robot.yaml", tmp_path)
+
+
+def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found, folder = config(), tmp_path / "runs" / "robot"
+    (tmp_path / "robot.yaml").write_text(robots.to_yaml(found))
+    folder.mkdir(parents=True)
+    session(folder, "1.json", found, count=20, lag=0.045, lag_deviation=0.001, spread=0.006)
+    run = run_dir.Run(tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"robot.yaml: calibration.clock.lag .*1.json"):
+        monkeypatch.setattr(
+            tuning.loop, "experiment_of", lambda *_: SimpleNamespace(task=SimpleNamespace(robot=paper()))
+        )
+        tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", Console(), ROBOT)
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,31 @@ def test_robot_yaml_names_the_robot_that_stands_there(tmp_path):
     assert robots.standing(path) == PAPER
 
 
+@pytest.mark.parametrize(
+    "name, content, says",
+    [
+        (UR10E, {"axes": [{}, {}]}, "axes: expected 1 entries for ur10e_rail, .*rail, got 2"),
+        (
+            UR10E,
+            {"axes": [{}], "axes_motion": {"speed": 1.0}},
+            "axes_motion.speed: expected at least 2.0 m/s, which rail",
+        ),
+        (UR10E, {"axes": [{}], "safety": {"still": [0.05] * 8, "overshoot": [0.05] * 8}}, "safety.*8 positive numbers"),
+        (FR3, {"axes": [{}]}, "axes: expected 0 entries for fr3_pedestal, got 1"),
+        (
+            FR3,
+            {"axes": [], "calibration": {"robot": {"joint_zeros": [0.01] * 6, "axes_zero": [], "date": "2026-11-22"}}},
+            "robot.joint_zeros: expected 7 entries for fr3_pedestal, .* got 6",
+        ),
+    ],
+)
+def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path, name, content, says):
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match=says):
+        robots.load_robot(path, contract=simulated.load_shipped(name).contract)
+
+
 def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_path):
     robot = simulated.load_shipped(FR3)
     found = robots.load_rig(None, robot)

@@ -104,18 +104,16 @@ def test_without_one_finite_episode_nothing_changes(updated, trainers, pool):
 OTHERS = {
     "a network of one's own": "definitions: |\n" + indent(SMALL, "  ") + "\nnetwork: small\nballs: player3/M0",
     "another robot": "robot: ur10e_rail\nballs: player3/M0",
-    "MuJoCo MJX": "balls: player3/M0",
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_networks_robots_and_engines_learn_as_well(kind, tmp_path):
+def test_other_networks_and_robots_learn_as_well(kind, tmp_path):
     """A step along the gradient of one update plays these very balls better."""
     file = tmp_path / "other.yaml"
-    engine = "mjx" if kind == "MuJoCo MJX" else "fused"
     file.write_text(
-        f"name: other\n{OTHERS[kind]}\ntask: {{sim_rate: 75.0, engine: {engine}}}\n"
+        f"name: other\n{OTHERS[kind]}\ntask: {{sim_rate: 75.0}}\n"
         "optimiser: {gradient: first_order, num_directions: 1, repeats: 8, sigma: 1.0e-6, ema_decay: 0.0, "
         "step: {kind: sgd, learning_rate: 0.003, schedule: {kind: constant}}}\ntraining: {pool: 32, devices: 1}\n"
     )

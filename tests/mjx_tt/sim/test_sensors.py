@@ -189,6 +189,16 @@ def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
     np.testing.assert_allclose(seen, wanted, rtol=1e-6)
 
 
+@pytest.mark.parametrize("memory", [0.0, 1e-9, 1e-6, 1e-4, 8e-4])
+def test_a_filter_of_hardly_any_memory_shows_nothing(memory):
+    """Of 40 mm of surprise, and whatever came before."""
+    lag = Lag.settle(0.008, memory, jnp.zeros(3)).predict(0.008, jnp.array([0.0, 0.0, 5.0]), 0.008)
+    for _ in range(20):
+        lag = lag.correct(0.008, 0.008, memory, 1.0)
+        assert float(jnp.abs(lag.position).max()) < 1e-5
+        lag = lag.predict(0.008, jnp.zeros(3), 0.0)
+
+
 def test_a_filter_of_constant_acceleration_is_wrong_behind_a_bounce_in_an_episode():
     """A ball dropped without drag: bounce and the error behind it in closed form, sampled at the substeps' rate."""
     height, memory, g = 0.8, 0.04, 9.81
