@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import h5py
 import numpy as np
 import pytest
 
@@ -183,3 +186,36 @@ def test_aimy_balls_fly_to_the_robot_and_bounce_on_its_half():
             assert trajectory.position[1, 0] > 1.0
             # The last sample of the free flight is close above the table and still falling.
             assert free_flight(trajectory).position[2, -1] < 0.07
+
+
+def test_malformed_deepmind_states_name_entry_and_field(tmp_path):
+    path = tmp_path / "states.json"
+    entry = {"id": 1, **{f"{p}_{a}": 0.5 for p in ("pos", "vel", "w_vel") for a in "xyz"}}
+    path.write_text(json.dumps([entry]))
+    assert read(path).state.position.shape == (3, 1)
+    for change, message in (
+        ({"vel_y": "fast"}, "entry 1, field 'vel_y': a finite number is wanted, got 'fast'"),
+        ({"pos_x": None}, "entry 1, field 'pos_x'"),
+        ({"w_vel_z": float("nan")}, "entry 1, field 'w_vel_z'"),
+    ):
+        path.write_text(json.dumps([entry, {**entry, **change}]))
+        with pytest.raises(ValueError, match=message):
+            read(path)
+    path.write_text("[{")
+    with pytest.raises(ValueError, match="states.json: not readable as a table"):
+        read(path)
+
+
+def test_malformed_aimy_names_the_group(tmp_path):
+    path = tmp_path / "launcher.hdf5"
+    with h5py.File(path, "w") as file:
+        file["originals/0/positions"] = np.zeros((5, 3))
+    with pytest.raises(ValueError, match="/originals/0 has no time_stamps"):
+        read(path)
+    with h5py.File(path, "w") as file:
+        file["something"] = 1
+    with pytest.raises(ValueError, match="no group /originals .* found: something"):
+        read(path)
+    path.write_bytes(b"no hdf5")
+    with pytest.raises(ValueError, match="not readable as HDF5"):
+        read(path)

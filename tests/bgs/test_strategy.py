@@ -236,3 +236,43 @@ def test_equal_configurations_share_one_compilation():
         for key in jax.random.split(jax.random.key(seed), 3):
             state, _ = bgs.tell(state, bgs.ask(key, state, config), jax.random.normal(key, 14), config)
     assert (strategy._sample._cache_size() - before[0], bgs.tell._cache_size() - before[1]) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("num_directions", 0),
+        ("num_directions", 2.5),
+        ("sigma", 0.0),
+        ("sigma", math.nan),
+        ("elite_fraction", 0.0),
+        ("elite_fraction", 1.1),
+        ("rank", "top"),
+        ("weighting", "z"),
+        ("normalise", "max"),
+        ("scale", "unit"),
+        ("ema_decay", 1.0),
+        ("step", "adam"),
+    ],
+)
+def test_bad_configuration_names_key_value_and_choice(key, value):
+    with pytest.raises(ValueError, match=rf"BGSConfig\.{key} = {value!r}, allowed is"):
+        bgs.BGSConfig(**{key: value})
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: optimizers.make("rmsprop"), "kind = 'rmsprop'.*sgd.*adam"),
+        (lambda: optimizers.make("sgd", -1.0), "learning_rate = -1.0"),
+        (lambda: optimizers.make("adam", b2=1.0), "b2 = 1.0"),
+        (lambda: optimizers.make("adam", weight_decay=-0.1), "weight_decay = -0.1"),
+        (lambda: optimizers.cosine(0.1, 0.0, 10), "final = 0.0"),
+        (lambda: optimizers.cosine(0.1, 0.01, 10, hold=1.0), "hold = 1.0"),
+        (lambda: optimizers.cosine(0.1, 0.01, 0), "updates = 0"),
+        (lambda: optimizers.piecewise(0.1, ((20, 0.2), (10, 0.1))), "increasing"),
+    ],
+)
+def test_bad_steps_are_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -69,6 +70,16 @@ def test_content_becomes_the_type_and_nothing_is_converted_silently():
                 "shapes.c.kind: expected 'square' or 'circle', got nothing; it says which kind of mapping this is",
             ],
         ),
+        (
+            {"delays": {"arm.delay": [0.5, 0.25], "arm.dely": [0, 1]}, "camera": [True, math.nan]},
+            [
+                "camera: expected a mapping with the keys place, rate, mode, got [True, nan]",
+                "delays.arm.delay: expected numbers in ascending order, got [0.5, 0.25]",
+                "delays.arm.dely: expected one of the keys arm.delay, got the unknown key 'arm.dely'; "
+                "did you mean 'arm.delay'?",
+            ],
+        ),
+        ([1], ["expected a mapping with the keys camera, shapes, delays, got [1]"]),
     ],
 )
 def test_every_mistake_is_named_with_key_expected_given_and_remedy(data, lines):

@@ -18,6 +18,7 @@ from mjx_tt.env.task import (
     OUT_OF_REACH,
     Task,
     TaskConfig,
+    weigh_rewards,
 )
 from mjx_tt.env.terms import ObservationTerm
 from mjx_tt.robot import mjcf, robots
@@ -281,3 +282,18 @@ def test_ball_noise_is_two_diameters_wide_and_the_joints_have_none(flailing):
     assert (np.abs(noise) < 0.04).all()
     assert stats.kstest(noise.ravel(), "uniform", (-0.04, 0.08)).pvalue > 1e-3
     np.testing.assert_allclose(seen[:, 3:], np.broadcast_to(task().home[:, None], (TICKS, N_JOINTS, P)), atol=1e-12)
+
+
+def test_mistakes_in_the_configuration_are_named():
+    for change, message in (
+        (dict(engine="bullet"), r"engine 'bullet' is not one of \('fused', 'mjx'\)"),
+        (dict(sim_rate=320.0), "sim_rate 320.0 Hz is not a whole multiple of control_rate 75.0 Hz"),
+        (dict(sim_rate=50.0), "not a whole multiple"),
+        (dict(max_steps=0), "max_steps is 0"),
+        (dict(rewards=2 * weigh_rewards({})), "rewards has a name twice"),
+        (dict(observations=()), "observations must begin with ball and joints"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            TaskConfig(**change)
+    with pytest.raises(ValueError, match="rewards: styl is no reward term; allowed: .*style"):
+        weigh_rewards({"styl": 1.0})

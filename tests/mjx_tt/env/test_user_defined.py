@@ -84,13 +84,47 @@ GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, r
     ("text", "says"),
     [
         ("def f(:\n", r"line 1: invalid syntax"),
+        (GOOD + "import nothing_of_that_name\n", r"line 3: ModuleNotFoundError: No module named 'nothing_of"),
+        (GOOD, "defines nothing"),
         (
             GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n",
             "'style': the name is one of the package's own",
         ),
+        (GOOD + "@reward_term('a b')\ndef f(step):\n    return 0.0\n", "must be letters, digits"),
+        (GOOD + "@reward_term('x', per='day')\ndef f(step):\n    return 0.0\n", "per is 'day', allowed: step, ball"),
+        (GOOD + "@reward_term('x', reduce='max')\ndef f(step):\n    return 0.0\n", "'max', allowed: mean, one_minus"),
+        (
+            GOOD + "".join(f"@reward_term('x')\ndef {name}(step):\n    return 0.0\n" for name in "fg"),
+            "'x': defined twice",
+        ),
+        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.bal\n", "line 5: AttributeError: .*bal"),
+        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.ball[0]\n", "rows of numbers"),
+        (GOOD + "@observation_term('ball_x')\ndef f(sensed):\n    return sensed.ball\n", "the package's own"),
         (GOOD + "@reward_term('x')\ndef f(step):\n    return step.comand\n", "line 5: AttributeError: .*comand"),
         (GOOD + "@reward_term('x')\ndef f(step):\n    return step.command\n", r"returns an array \(8, 2, 3\)"),
+        (
+            GOOD + "@reward_term('x')\ndef f(step):\n    return 1 if step.bounced else 0\n",
+            "line 5: The truth value",
+        ),
         (GOOD + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    pass\n", "has no start and no step"),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (7, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, s))\n",
+            r"returns an action \(7,\), \(8,\) is wanted",
+        ),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, x))\n",
+            "another kind of state",
+        ),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (8, 0)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (x, s))\n",
+            "positive whole numbers",
+        ),
     ],
 )
 def test_a_mistake_in_the_file_is_named(text, says):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
@@ -143,3 +144,23 @@ def test_tiring_and_getting_used_to_the_robot_follow_their_geometric_laws():
     )
     speed = float(jnp.linalg.norm(ball.ball.velocity[:, 0]))
     np.testing.assert_allclose(np.asarray(state.expected)[:, 0], [0.0, 0.7, speed], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["first"].update(x=[1.0, 0.0, 2.0]), r"first\.x: expected .* ascending order, got \[1.0, "),
+        (lambda d: d["ability"].update(miss="often"), r"ability\.miss: expected a finite number, got 'often'"),
+        (lambda d: d["ability"].update(rech=1.0), r"ability\.rech: expected .*; did you mean 'reach'\?"),
+        (lambda d: d.pop("spin"), r"spin: expected a mapping .*, got nothing"),
+        (lambda d: d.update(person=3), r"person: expected a mapping .*, got 3"),
+    ],
+)
+def test_errors_name_file_and_key(tmp_path, change, message):
+    data = human_player.to_dict(human_player.load("player1"))
+    change(data)
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump(data))
+    with pytest.raises(ValueError, match=message) as error:
+        human_player.read(path)
+    assert str(path) in str(error.value)
