@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from ballmodel.distribution import BallDistribution, BallFile
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.ranges import Within
 from ballmodel.io.validation import Finite, Section, validate
-from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
 
 ROWS = tuple(f"{part}.{axis}" for part in ("position", "velocity", "spin") for axis in "xyz")
@@ -129,11 +127,6 @@ def parse_mixture(data: Any, where: str, name: str = "", source: str = "") -> Ba
         return BallMixture(weights, means, covariances, **file.labels(name, source))
     except ValueError as error:
         raise ValueError(f"{where}: components: {error}") from None
-
-
-def load_mixture(path: str | os.PathLike) -> BallMixture:
-    """Reads a mixture from YAML. Raises ValueError naming file and key."""
-    return parse_mixture(read_yaml(path), str(path), name=Path(path).stem)
 
 
 def save_mixture(path: str | os.PathLike, mixture: BallMixture) -> None:

@@ -115,34 +115,6 @@ def test_names_of_a_page_exist(page):
     assert not missing, "\n".join(missing)
 
 
-def test_every_statement_of_the_paper_has_a_place_and_a_class():
-    rows = re.findall(
-        r"^\| (\d+) \| (.+?) \| (.+?) \| (.+?) \|$", text_of(ROOT / "docs/reference/paper.md"), re.MULTILINE
-    )
-    assert [int(number) for number, *_ in rows] == list(range(1, len(rows) + 1))
-    classes = ("exact", "equivalent, because", "differs", "not done, because")
-    found = dict.fromkeys(classes, 0)
-    for number, _, where, text in rows:
-        assert CODE.search(where), f"statement {number}: no place"
-        kind = next((kind for kind in classes if re.match(rf"{kind}\b", text)), None)
-        assert kind, f"statement {number}: expected one of {', '.join(classes)}, got {text!r}"
-        found[kind] += 1
-    counted = dict(
-        re.findall(r"^\| ([a-z, ]+) \| [^|]+ \| (\d+) \|$", text_of(ROOT / "docs/reference/paper.md"), re.MULTILINE)
-    )
-    assert {kind: int(count) for kind, count in counted.items()} == found
-
-
-def test_every_difference_of_a_key_says_what_was_measured():
-    page = text_of(ROOT / "docs/reference/paper.md")
-    table = page.partition("## Differences from the paper")[2].partition("\n## ")[0]
-    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| `")]
-    assert len(rows) > 20
-    for key, paper, default, *effect in rows:
-        assert key and paper and default and len(effect) == 1, key
-        assert "not measured" in effect[0] or "row above" in effect[0] or re.search(r"\d", effect[0]), key
-
-
 def test_names_in_docstrings_exist():
     missing = [
         f"{path.relative_to(ROOT)}:{line}: `{code}`: {word}"

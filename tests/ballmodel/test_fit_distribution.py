@@ -8,11 +8,10 @@ import pytest
 from ballmodel.distribution import AXES, BallDistribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
-from ballmodel.io import MeasuredStates, read
+from ballmodel.io import MeasuredStates
 from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset, Trajectory
 from tests.ballmodel.test_initial_state import flight
-from tests.support.paths import MEASURED
 
 
 def test_serves_start_behind_their_bounce():
@@ -100,25 +99,3 @@ def test_a_persons_short_balls_are_drawn_if_asked_for_and_if_there_are_any():
             box, report = fit_human(strokes, ball_params(), eps=50.0, short_balls=asked)
             assert box.short_balls == (asked and short)
             assert (report.outcomes["bounce on the table a second time"] == n) == short
-
-
-@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
-def test_both_fits_agree_on_a_ball_launcher():
-    measured = read(MEASURED / "aimy_launcher" / "mn5008_topspin.hdf5")
-    newton, _ = fit_human(measured, ball_params(), eps=100.0)
-    simplex, report = fit_human(measured, ball_params(), eps=100.0, fit="nelder-mead")
-    assert report.landing.shape[1] > 10
-    np.testing.assert_allclose(sixteen(simplex), sixteen(newton), atol=1e-4)
-
-
-def test_what_nelder_mead_cannot_fit_is_named():
-    measured, _ = recording(2)
-    with pytest.raises(ValueError, match=r"fit 'simplex' is not one of \('gauss-newton', 'nelder-mead'\)"):
-        fit_human(measured, ball_params(), fit="simplex")
-    short = Dataset(tuple(t.part(0, 3) for t in measured), "short")
-    with pytest.raises(ValueError, match="no trajectory to fit"):
-        fit_human(short, ball_params(), fit="nelder-mead")
-    still = np.zeros((3, 2))
-    states = MeasuredStates(np.arange(2), BallState(still, still, still), "states")
-    with pytest.raises(ValueError, match="states: holds start states; nelder-mead fits trajectories"):
-        fit_human(states, ball_params(), fit="nelder-mead")

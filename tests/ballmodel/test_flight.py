@@ -12,12 +12,10 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ballmodel import constants as c
-from ballmodel import registry
-from ballmodel.aerodynamics import SATURATING_LIFT, FlightParams, acceleration, drag_factor, magnus_factor
+from ballmodel.aerodynamics import SATURATING_LIFT, FlightParams
 from ballmodel.contact import PaddleParams, SurfaceParams
 from ballmodel.flight import PaddlePose, ball_params, free_step, step
 from ballmodel.partial_params import without_nominal
-from ballmodel.sampling import sample_pool, throw
 from ballmodel.state import ball_state
 
 VACUUM = FlightParams(drag_coefficient=0.0)
@@ -45,28 +43,34 @@ def run(params, state, dt, n, paddle=None):
     return jax.lax.scan(advance, (state, touched), None, length=n)[0]
 
 
-def reference(params, position, velocity, spin, time):
-    """The equation of motion by DOP853 on plain NumPy."""
-    k_d = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
-    k_m = params.magnus_coefficient * 1.29 * 1.256e-3 * 0.02 / (2 * 0.0027)
+def reference(p, position, velocity, spin, time):
+    """The equation of motion by DOP853 on plain NumPy; place and spin at the end."""
+    per_area = 1.29 * 1.256e-3 / (2 * 0.0027)
+    weight = np.array([p.gravity_x, p.gravity_y, p.gravity_z]) * (1 - p.buoyancy)
 
     def derivative(t, y):
-        v = y[3:]
-        lift = k_m * np.cross(spin * np.exp(-params.spin_decay * t), v)
-        return np.concatenate([v, [0, 0, -9.81] - k_d * np.linalg.norm(v) * v + lift])
+        u, omega = y[3:6] - [p.wind_x, p.wind_y, p.wind_z], y[6:]
+        speed = np.linalg.norm(u)
+        lift = p.magnus_coefficient / (1 + p.lift_saturation * 0.02 * np.linalg.norm(omega) / speed)
+        force = per_area * (lift * 0.02 * np.cross(omega, u) - p.drag_coefficient * speed * u)
+        return np.concatenate([y[3:6], weight + force, -p.spin_decay * omega])
 
-    solution = solve_ivp(derivative, (0, time), [*position, *velocity], method="DOP853", rtol=1e-12, atol=1e-12)
-    return solution.y[:3, -1]
+    start = [*position, *velocity, *spin]
+    end = solve_ivp(derivative, (0, time), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    return end[:3], end[6:]
 
 
 def test_converges_to_the_differential_equation_at_the_order_of_its_integrator():
     position, velocity, spin = np.array([0.2, 1.5, 0.3]), np.array([0.8, -7.0, 2.0]), np.array([60.0, 20.0, -40.0])
+    air = {"wind_x": 0.7, "wind_y": -0.4, "wind_z": 0.2, "buoyancy": 0.0149, "gravity_x": 0.3, "gravity_y": -0.2}
     for integrator, order in (("paper", 1), ("midpoint", 2)):
-        params = FlightParams(magnus_coefficient=0.6, spin_decay=0.4, integrator=integrator)
-        exact = reference(params, position, velocity, spin, 0.5)
+        params = FlightParams(**SATURATING_LIFT, **air, spin_decay=0.4, integrator=integrator)
+        exact, spun = reference(params, position, velocity, spin, 0.5)
         state = ball_state(position, velocity, spin)
-        coarse, fine = (np.linalg.norm(fly(params, state, 0.5 / n, n).position - exact) for n in (150, 300))
-        assert coarse / fine == pytest.approx(2.0**order, rel=0.1)
+        coarse, fine = (fly(params, state, 0.5 / n, n) for n in (150, 300))
+        errors = [np.linalg.norm(end.position - exact) for end in (coarse, fine)]
+        assert errors[0] / errors[1] == pytest.approx(2.0**order, rel=0.1) and errors[1] < 0.01
+        np.testing.assert_allclose(fine.spin, spun, rtol=1e-9)
 
 
 def test_the_papers_step_is_the_papers_formula():
@@ -76,34 +80,6 @@ def test_the_papers_step_is_the_papers_formula():
     state = free_step(FlightParams(), ball_state(np.zeros(3), v), dt)
     np.testing.assert_allclose(state.position, dt * (v + dt * a / 2), rtol=1e-14)
     np.testing.assert_allclose(state.velocity, v + dt * a, rtol=1e-14)
-
-
-def test_vacuum_flight_is_a_parabola_at_any_step():
-    v = np.array([1.0, -5.0, 3.0])
-    state = fly(VACUUM, ball_state(np.zeros(3), v), 0.05, 10)
-    np.testing.assert_allclose(state.position, v * 0.5 + 0.5 * np.array([0, 0, -9.81]) * 0.25, rtol=1e-13)
-
-
-def test_buoyancy_takes_its_fraction_of_gravity():
-    state = fly(replace(VACUUM, buoyancy=0.0149), ball_state(np.zeros(3), np.zeros(3)), 0.01, 50)
-    assert float(state.position[2]) == pytest.approx(-0.5 * 9.81 * (1 - 0.0149) * 0.25, rel=1e-12)
-
-
-def test_falls_at_terminal_velocity():
-    params = FlightParams()
-    state = fly(params, ball_state(np.zeros(3), np.zeros(3)), 1 / 300, 3000)
-    assert float(state.velocity[2]) == pytest.approx(-np.sqrt(9.81 / drag_factor(params)), rel=1e-6)
-
-
-def test_magnus_force_alone_turns_the_ball_on_a_circle():
-    params = FlightParams(drag_coefficient=0.0, magnus_coefficient=1.0, gravity_z=0.0, integrator="midpoint")
-    speed, spin = 5.0, 100.0
-    rate = magnus_factor(params) * spin
-    n = 20000
-    state = ball_state(np.array([0.0, 0.0, 0.0]), np.array([speed, 0, 0]), np.array([0, 0, spin]))
-    quarter = fly(params, state, np.pi / 2 / rate / n, n)
-    np.testing.assert_allclose(quarter.position, [speed / rate, speed / rate, 0], atol=1e-6 * speed / rate)
-    np.testing.assert_allclose(quarter.velocity, [0, speed, 0], atol=1e-6 * speed)
 
 
 def test_saturating_lift_turns_the_ball_on_a_wider_circle():
@@ -118,39 +94,6 @@ def test_saturating_lift_turns_the_ball_on_a_wider_circle():
     np.testing.assert_allclose(quarter.velocity, [0, speed, 0], atol=1e-2)
 
 
-def test_saturating_lift_falls_as_measured_and_is_the_constant_law_at_no_saturation():
-    """The constant k that gives the same force is 1 / (0.55 + 3.55 S)."""
-    spins = np.array([0.15, 0.45, 0.65, 0.85, 1.3]) * 5.0 / 0.02
-    velocity, spin = np.tile([[0.0], [-5.0], [0.0]], 5), np.stack([spins, 0 * spins, 0 * spins])
-    still = FlightParams(drag_coefficient=0.0, gravity_z=0.0)
-
-    def lift(**changes):
-        return np.asarray(acceleration(replace(still, **changes), velocity, spin)[2])
-
-    saturating = {name: value for name, value in SATURATING_LIFT.items() if name != "drag_coefficient"}
-    constant = lift(**saturating) / lift(magnus_coefficient=1.0)
-    assert (np.diff(constant) < 0).all()
-    np.testing.assert_allclose(constant, 1 / (0.55 + 3.55 * spins * 0.02 / 5.0), rtol=1e-3)
-    np.testing.assert_allclose(
-        lift(magnus_coefficient=0.6, lift_saturation=0.0), lift(magnus_coefficient=0.6), rtol=1e-14
-    )
-    at_rest = acceleration(replace(still, **saturating), np.zeros((3, 1)), np.zeros((3, 1)))
-    np.testing.assert_array_equal(np.stack(list(at_rest)), np.zeros((3, 1)))
-
-
-def test_topspin_pulls_a_ball_towards_the_robot_down():
-    params = FlightParams(magnus_coefficient=0.6)
-    top = free_step(params, ball_state(np.zeros(3), np.array([0, -6.0, 0]), np.array([50.0, 0, 0])), 0.01)
-    plain = free_step(params, ball_state(np.zeros(3), np.array([0, -6.0, 0])), 0.01)
-    assert float(top.velocity[2]) < float(plain.velocity[2])
-
-
-def test_spin_decays_exponentially():
-    state = ball_state(np.zeros(3), np.array([0, -5.0, 0]), np.array([30.0, -20.0, 10.0]))
-    end = fly(FlightParams(spin_decay=0.5), state, 0.01, 100)
-    np.testing.assert_allclose(end.spin, np.array([30.0, -20.0, 10.0]) * np.exp(-0.5), rtol=1e-12)
-
-
 def test_drag_never_adds_energy():
     rng = np.random.default_rng(0)
     state = ball_state(rng.uniform(0, 2, (3, 500)), rng.normal(0, 8, (3, 500)))
@@ -163,26 +106,6 @@ def test_drag_never_adds_energy():
         return new, energy(new) - energy(s)
 
     assert float(jax.lax.scan(advance, state, None, length=300)[1].max()) < 0.0
-
-
-def test_wind_is_a_moving_frame():
-    wind = np.array([0.7, -0.4, 0.2])
-    params = FlightParams(magnus_coefficient=0.6, gravity_z=0.0)
-    windy = replace(params, wind_x=wind[0], wind_y=wind[1], wind_z=wind[2])
-    v, spin = np.array([0.5, -6.0, 1.0]), np.array([40.0, 10.0, 5.0])
-    still = fly(params, ball_state(np.zeros(3), v - wind, spin), 0.01, 50)
-    blown = fly(windy, ball_state(np.zeros(3), v, spin), 0.01, 50)
-    np.testing.assert_allclose(blown.position, still.position + wind * 0.5, atol=1e-12)
-
-
-def test_unknown_integrator_is_refused():
-    with pytest.raises(ValueError, match="'rk4' is not one of"):
-        free_step(FlightParams(integrator="rk4"), ball_state(np.zeros(3), np.zeros(3)), 0.01)
-
-
-def test_states_of_different_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"velocity has shape \(2,\)"):
-        ball_state(np.zeros(3), np.zeros(2))
 
 
 def test_ball_dropped_from_30_cm_rebounds_23_cm():
@@ -210,29 +133,6 @@ def test_a_bounce_does_not_depend_on_where_in_the_step_it_falls():
     back = -shift
     position = end.position + end.velocity * back[None] + 0.5 * g * back[None] ** 2
     np.testing.assert_allclose(position, position[:, :1] + np.zeros((3, n)), atol=1e-11)
-
-
-def landing_shift(name, integrator, dt):
-    """Median distance [m] that landing points of a pool move when the step is halved."""
-    params = ball_params()
-    with jax.enable_x64(False):
-        state = sample_pool(jax.random.key(1), registry.load(name), params, 500).state
-    state = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), state)
-    params = replace(params, flight=replace(params.flight, integrator=integrator))
-    everywhere = (-2.0, -2.0), (2.0, 2.0)
-    coarse, fine = (jax.jit(throw)(params, state, *everywhere, step_dt).landing for step_dt in (dt, dt / 2))
-    return np.median(np.linalg.norm(coarse - fine, axis=0))
-
-
-@pytest.mark.parametrize("name", ["narrow", "medium", "player1/M2"])
-def test_halving_the_midpoint_step_moves_landing_points_by_less_than_a_millimetre(name):
-    assert 0.0 < landing_shift(name, "midpoint", 1 / 300) < 1e-3
-
-
-@pytest.mark.parametrize("name", ["narrow", "medium", "player1/M2"])
-def test_halving_the_papers_step_moves_landing_points_by_less_than_a_millimetre_at_450_hz(name):
-    """At 300 Hz the paper's first-order step moves them by 1.06 mm (narrow), 1.24 mm (medium), 0.65 mm (player1/M2)."""
-    assert 0.0 < landing_shift(name, "paper", 1 / 450) < 1e-3
 
 
 @pytest.mark.parametrize("speed", [3.0, 14.0, 35.0])
@@ -315,23 +215,6 @@ def test_paddle_impact_is_the_same_seen_from_a_moving_frame():
         assert bool(e1.paddle) and bool(e2.paddle)
         np.testing.assert_allclose(moving.velocity, rest.velocity + boost, atol=1e-10)
         np.testing.assert_allclose(moving.spin, rest.spin, atol=1e-9)
-
-
-def test_a_turning_paddle_moves_its_contact_point():
-    params = replace(
-        ball_params(),
-        flight=replace(VACUUM, gravity_z=0.0),
-        paddle=PaddleParams(restitution=1.0, restitution_slope=0.0, tangential_gain=0.0),
-    )
-    rate, offset = 4.0, 0.05
-    start, end = still_pose([0, 0, 0.5], [0, 1, 0])
-    turning = jnp.array([0, 0, rate])
-    start, end = replace(start, angular_velocity=turning), replace(end, angular_velocity=turning)
-    state = ball_state(np.array([offset, 0.03, 0.5]), np.array([0, -5.0, 0]))
-    new, events = step(params, state, 0.01, (start, end))
-    assert bool(events.paddle)
-    # An elastic wall that moves at rate * offset towards the ball.
-    assert float(new.velocity[1]) == pytest.approx(5.0 + 2 * rate * offset, rel=1e-9)
 
 
 TILT = (0.04, -0.07)  # dz/dx, dz/dy
@@ -439,12 +322,3 @@ def test_a_shifted_blade_turns_about_the_unshifted_centre():
     contact_point = np.array([0.02, 0.03 + c.PADDLE_THICKNESS / 2, 0.0])
     ball_point = np.array(new.velocity) + np.cross(new.spin, [0, -c.BALL_RADIUS, 0])
     np.testing.assert_allclose(ball_point, np.cross(spin, contact_point), atol=1e-9)
-
-
-def test_a_blade_that_lies_flat_is_not_turned():
-    params = replace(ball_params(), flight=replace(VACUUM, gravity_z=0.0))
-    state, pose = ball_state(np.array([0, 0, 0.54]), np.array([0.3, 0, -5.0])), still_pose([0, 0, 0.5], [0, 0, 1])
-    nominal, _ = step(params, state, 0.01, pose)
-    tilted, events = step(replace(params, paddle=PaddleParams(tilt=0.1)), state, 0.01, pose)
-    assert bool(events.paddle)
-    np.testing.assert_allclose(tilted.velocity, nominal.velocity, atol=1e-12)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 
-from ballmodel import initial_state, registry
 from ballmodel.aerodynamics import FlightParams
-from ballmodel.fit_distribution import fit_human
-from ballmodel.flight import ball_params
 from ballmodel.initial_state import fit_gauss_newton, fit_nelder_mead
 from ballmodel.io import read
-from ballmodel.sampling import sample_pool
-from ballmodel.trajectory import Dataset, Trajectory, free_flight
+from ballmodel.trajectory import Trajectory, free_flight
 from tests.support.paths import MEASURED
 
 K_D = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
@@ -85,26 +80,6 @@ def test_covariance_predicts_the_error():
     assert np.mean(squared) == pytest.approx(6.0, abs=4 * 0.18)
 
 
-def test_a_batch_of_different_lengths_equals_single_fits():
-    trajectories, _ = balls(6, [8, 30, 15, 32, 5, 21], 0.002, seed=2)
-    together = fit_gauss_newton(trajectories, FlightParams())
-    for i, trajectory in enumerate(trajectories):
-        alone = fit_gauss_newton([trajectory], FlightParams())
-        np.testing.assert_allclose(unknowns(together.state)[:, i], unknowns(alone.state)[:, 0], atol=1e-9)
-        np.testing.assert_allclose(together.covariance[..., i], alone.covariance[..., 0], rtol=1e-6)
-
-
-def test_a_gap_in_the_samples_does_not_change_the_flight():
-    trajectories, truth = balls(5, 50, 0.0, seed=3)
-    keep = np.r_[0:10, 30:50]
-    thinned = []
-    for t in trajectories:
-        fine = flight(truth[:, len(thinned)], t.time[keep])
-        thinned.append(Trajectory("", t.name, t.time[keep], fine))
-    result = fit_gauss_newton(thinned, FlightParams())
-    np.testing.assert_allclose(unknowns(result.state), truth, atol=1e-7)
-
-
 def test_known_spin_is_used():
     spin = np.array([70.0, -20.0, 30.0])
     trajectories, truth = balls(5, 40, 0.0, magnus=0.6, spin=spin)
@@ -129,52 +104,6 @@ def test_huber_loss_shrugs_off_stray_samples():
     assert robust.converged.all()
 
 
-def test_same_shapes_compile_once():
-    for seed in (0, 1):
-        trajectories, _ = balls(7, 20, 0.001, seed=seed)
-        fit_gauss_newton(trajectories, FlightParams(drag_coefficient=0.4 + 0.1 * seed))
-        if seed == 0:
-            compiled = initial_state._levenberg_marquardt._cache_size()
-    assert initial_state._levenberg_marquardt._cache_size() == compiled
-    assert not jax.config.jax_enable_x64
-
-
-def test_refuses_what_cannot_be_fitted():
-    trajectories, _ = balls(3, 10, 0.0)
-    short = trajectories[1].part(0, 3)
-    with pytest.raises(ValueError, match="1 of 2 .* fewer than 4 samples .* trajectory s/1 with 3"):
-        fit_gauss_newton([trajectories[0], short], FlightParams())
-    with pytest.raises(ValueError, match=r"spin has shape \(3, 2\), \(3, 3\) is wanted"):
-        fit_gauss_newton(trajectories, FlightParams(), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="no trajectory"):
-        fit_gauss_newton([], FlightParams())
-
-
-@pytest.mark.slow
-def test_trajectories_of_a_distribution_give_its_numbers_back():
-    """Balls drawn from a box, measured with noise up to their bounce, fitted: the box returns from inside."""
-    target = registry.load("medium")
-    pool = sample_pool(jax.random.key(0), target, ball_params(), 300)
-    rng = np.random.default_rng(0)
-    trajectories = []
-    for i in range(300):
-        start = np.concatenate([pool.state.position[:, i], pool.state.velocity[:, i]])
-        time = np.arange(200) / 125
-        clean = flight(start, time)
-        airborne = clean[:, : int(np.argmax(clean[2] < 0.02))]
-        noisy = airborne + rng.normal(0, 0.002, airborne.shape)
-        trajectories.append(Trajectory("home", str(i), time[: airborne.shape[1]], noisy))
-    distribution, report = fit_human(Dataset(tuple(trajectories), "synthetic"), ball_params(), name="me")
-    assert report.measured == 300 and report.landing.shape[1] > 290
-    assert np.median(report.fit_rms) == pytest.approx(0.002 * np.sqrt(3), rel=0.1)
-    kept = ~report.outliers.outlier
-    drawn = np.concatenate([pool.state.position, pool.state.velocity, pool.landing])
-    for name, low, high in (("position", 0, 3), ("velocity", 3, 6), ("landing", 6, 8)):
-        np.testing.assert_allclose(getattr(distribution, f"{name}_min"), drawn[low:high].min(1), atol=0.1)
-        np.testing.assert_allclose(getattr(distribution, f"{name}_max"), drawn[low:high].max(1), atol=0.1)
-    assert kept.mean() > 0.9
-
-
 @pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
 def test_launcher_balls_and_what_their_residuals_say():
     """A drag-only flight misses a topspin ball by more than a spinless one, and Magnus lift explains the difference."""
@@ -191,13 +120,3 @@ def test_launcher_balls_and_what_their_residuals_say():
             with_lift = fit_gauss_newton(flights, FlightParams(magnus_coefficient=0.6), spin)
             assert np.median(with_lift.rms) < 0.5 * rms[session]
     assert rms["no_spin_robot_simple"] < rms["mn5008_topspin"] < 0.03
-
-
-@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
-def test_measured_states_give_a_distribution_of_human_size():
-    distribution, report = fit_human(read(MEASURED / "deepmind_ball_states" / "rallies.json"), ball_params())
-    assert report.measured == 13088
-    assert sum(report.outcomes.values()) + report.elsewhere == 13088
-    # The paper's players never exceed 9 m/s; the outlier share must be small for minima and maxima to mean something.
-    assert -12.0 < distribution.velocity_min[1] < -6.0 and distribution.velocity_max[1] < 0.0
-    assert 0.0 < report.outliers.outlier.mean() < 0.05

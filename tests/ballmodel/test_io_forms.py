@@ -1,23 +1,18 @@
 """Tracks in the forms that people's files have, each read as the same balls.
 
-The balls are SciPy-free parabolas with one bounce; the forms are written by hand here, and by a program of other
-people's making where the shared one lies beside the repository.
+The balls are SciPy-free parabolas with one bounce; the forms are written by hand here.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from ballmodel.io import MeasuredStates, TrackOptions, read
-from tests.support.paths import MEASURED
+from ballmodel.io import TrackOptions, read
 
-FORMS = MEASURED.parent / "repro" / "tracks"
 RATE = 120.0
 
 
@@ -143,54 +138,3 @@ def test_what_a_person_says_counts(tmp_path):
     assert_same(read(path, options=TrackOptions(length="m")))
     with pytest.raises(ValueError, match="unit of length: expected one of m, cm, mm, got 'inch'"):
         TrackOptions(length="inch")
-
-
-def test_tables_that_hold_no_tracks_say_so(tmp_path):
-    path = tmp_path / "events.csv"
-    path.write_text("rally_id,type,timestamp,ball_pos\n1,shot,0.1,[1 2 3]\n")
-    with pytest.raises(ValueError, match="holds events, no tracks"):
-        read(path)
-    path.write_text("1,2,3\n4,5,6\n")
-    with pytest.raises(ValueError, match="row 1: 3 numbers and no header; write one"):
-        read(path)
-
-
-@pytest.fixture(scope="module")
-def forms(tmp_path_factory):
-    if not FORMS.is_dir():
-        pytest.skip(f"no forms of other people's making in {FORMS}")
-    folder = tmp_path_factory.mktemp("forms")
-    done = subprocess.run([sys.executable, str(FORMS / "make_forms.py"), str(folder)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return folder
-
-
-def test_forms_of_other_peoples_making_hold_the_same_balls(forms):
-    """Each file's samples are those of the plain one, but for its frame and for what its name says was lost."""
-    plain = np.concatenate([t.position.T for t in read(FORMS / "plain.csv")])
-    scarce = ("08", "09", "10", "11", "12", "31", "32", "33")  # lost rows, or another rate
-    framed = ("18", "19", "20", "21", "30")  # other coordinates
-    refused = {"44": "--salvage"}
-    read_whole = 0
-    for path in sorted(forms.iterdir()):
-        number = path.name[:2]
-        if path.name == "01_timestamp_XYZ_folder" or "one_flight" in path.name:
-            continue
-        if number == "46":  # a state for each shot
-            shots = read(path)
-            assert isinstance(shots, MeasuredStates) and np.isfinite(shots.landing).any(), path
-            continue
-        if number in refused:
-            with pytest.raises(ValueError, match=refused[number]):
-                read(path)
-            continue
-        found = np.concatenate([t.position.T for t in read(path)])
-        if number in scarce:
-            assert len(found) > 0.2 * len(plain), path
-            continue
-        assert found.shape == plain.shape, path
-        order, wanted = np.lexsort(found.T.round(5)), np.lexsort(plain.T.round(5))
-        if number not in framed:
-            np.testing.assert_allclose(found[order], plain[wanted], atol=1e-5, err_msg=path.name)
-            read_whole += 1
-    assert read_whole > 25

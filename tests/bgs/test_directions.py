@@ -3,7 +3,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy import stats
 
 from bgs import directions
@@ -58,12 +57,3 @@ def test_precision_follows_dtype():
     with jax.enable_x64(True):
         delta = directions.sample(jax.random.key(3), 30, 30, dtype=jnp.float64)
         np.testing.assert_allclose(np.asarray(delta.T @ delta), 30 * np.eye(30), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((4, 0), "num_directions = 0"), ((0, 4), "d = 0"), ((4, 4, True, "unit"), "scale = 'unit'.*sqrt_d.*chi")],
-)
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        directions.sample(jax.random.key(0), *arguments)

@@ -53,12 +53,3 @@ def test_the_tools_tcp_is_the_farthest_point_of_the_blade():
     far = model.site("paddle").pos[0] + model.geom("rig_paddle").size[0]
     found = re.search(r"tooldata paddle := \[TRUE, \[\[([^\]]+)\]", MODULE)
     assert found and list(map(float, found[1].split(","))) == pytest.approx([0.0, 0.0, 1e3 * far], abs=0.5)
-
-
-def test_names_and_blocks_of_the_files_match():
-    assert re.findall(r'"(\w+)" \\Joint', MODULE) == ["TT_BRIDGE"] and re.search(r"^Name +TT_BRIDGE$", PROTOCOL, re.M)
-    assert '"table_tennis"' in MODULE and '-name "table_tennis"' in MOTION
-    code = re.sub(r'!.*|"[^"\n]*"', "", MODULE)
-    for block in ("MODULE", "PROC", "TRAP", "WHILE", "IF"):
-        assert len(re.findall(rf"\b{block}\b", code)) == len(re.findall(rf"\bEND{block}\b", code)) > 0
-    assert max(map(len, re.findall(r"[A-Za-z_]\w*", code))) <= 32  # RAPID's longest name

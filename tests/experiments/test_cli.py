@@ -17,9 +17,8 @@ from scipy.integrate import solve_ivp
 from ballmodel.distribution import load_distribution
 from bgs import normalizer
 from experiments import cli
-from experiments.errors import RunError
 from experiments.evaluation import video
-from experiments.runs import checkpoint, load_policy, locate
+from experiments.runs import checkpoint, load_policy
 from experiments.training import finalize
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
@@ -95,12 +94,6 @@ for arguments, code in {lines!r}:
     assert metadata.version("mjx-tt") in done.stdout
 
 
-@pytest.mark.parametrize("seeds", ["0,0", "a", "1,", "-1"])
-def test_seeds_that_are_none(seeds, capsys):
-    assert cli.main(["train", "x.yaml", f"--seeds={seeds}"]) == 2
-    assert "different whole numbers separated by commas" in capsys.readouterr().err
-
-
 @pytest.mark.smoke
 def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
     _, runs, output = trained
@@ -138,23 +131,6 @@ def test_train_skips_what_is_done_and_one_failing_job_does_not_stop_the_others(t
     assert (runs / "tiny" / "evaluation.json").stat().st_mtime_ns == before
     summary = again.stdout[again.stdout.index("Summary") :]
     assert "failed" in summary and "done" in summary
-
-
-def test_train_refuses_another_configuration_in_the_same_folder(trained):
-    yaml, runs, _ = trained
-    refused = mjx_tt("train", yaml, "--out", runs, "--set", "optimiser.sigma=0.05", "--set", "training.max_minutes=9")
-    assert refused.returncode == 1
-    assert "optimiser.sigma: the run has 0.025, now 0.05" in refused.stdout
-    assert "max_minutes" not in refused.stdout  # which may change
-
-
-def test_train_into_a_folder_that_cannot_be_written(trained, tmp_path):
-    yaml, _, _ = trained
-    (tmp_path / "file").write_text("")
-    refused = mjx_tt("train", yaml, "--out", tmp_path / "file")
-    assert refused.returncode == 1
-    assert "cannot be written: Not a directory; choose another --out" in refused.stderr
-    assert "Traceback" not in refused.stdout + refused.stderr
 
 
 def test_mistake_in_a_yaml_ends_with_one_line(tmp_path):
@@ -201,13 +177,6 @@ def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_pa
     selection = json.loads((tmp_path / "tiny" / "selection.json").read_text())
     assert selection["best"] == "seed7" and -2 <= selection["scores"]["seed7"] <= 2
     assert "seed: 7" in (tmp_path / "tiny" / "seed7" / "config.yaml").read_text() and selection["robot"] is None
-
-
-def test_selection_needs_seeds(tmp_path, capsys):
-    assert cli.main(["train", "quickstart.yaml", "--select", "--out", str(tmp_path)]) == 1
-    assert "--seeds 0,1,2" in capsys.readouterr().err
-    assert cli.main(["train", "quickstart.yaml", "--robot", "lockstep", "--out", str(tmp_path)]) == 1
-    assert "give --select" in capsys.readouterr().err
 
 
 def test_policy_is_the_same_from_run_and_from_artefact(trained):
@@ -267,58 +236,13 @@ def test_import_and_fit_human(tmp_path):
         [distribution.position_min + distribution.velocity_min, distribution.position_max + distribution.velocity_max]
     )
     np.testing.assert_allclose(box, [starts.min(axis=0), starts.max(axis=0)], atol=0.01)
-    paper = mjx_tt("fit-human", tmp_path / "b.csv", "--fit", "nelder-mead", "--out", tmp_path / "paper.yaml")
-    assert paper.returncode == 0, paper.stdout + paper.stderr
-    assert f"flights fitted: {n}/{n}" in paper.stdout and "flights/s" in paper.stdout
-    ours, theirs = (load_distribution(tmp_path / f"{name}.yaml") for name in ("anna", "paper"))
-    np.testing.assert_allclose(
-        theirs.velocity_min + theirs.landing_max, ours.velocity_min + ours.landing_max, atol=1e-4
-    )
-    malformed = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
-    assert malformed.returncode == 1 and ".csv, .mcap" in malformed.stderr
-
-
-def test_what_nelder_mead_cannot_fit_is_refused(tmp_path, capsys):
-    fields = ("id", "pos_x", "pos_y", "pos_z", "vel_x", "vel_y", "vel_z", "w_vel_x", "w_vel_y", "w_vel_z")
-    ball = dict(zip(fields, (1, 0.0, 1.0, 0.3, 0.0, -5.0, 1.0, 0.0, 0.0, 0.0), strict=True))
-    (tmp_path / "states.json").write_text(json.dumps([ball]))
-    given = ["fit-human", str(tmp_path / "states.json"), "--fit", "nelder-mead", "--out", str(tmp_path / "a.yaml")]
-    assert cli.main([*given, "--model", str(tmp_path / "states.json")]) == 1
-    assert "leave one of the two out" in " ".join(capsys.readouterr().err.split())
-    assert cli.main(given) == 1
-    assert "holds start states, which need no fit" in " ".join(capsys.readouterr().err.split())
-    given[3] = "simplex"
-    assert cli.main(given) == 2
-    assert "gauss-newton" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     "command, given, says",
     [
         ("train", "study_quick.yaml", "the shipped study_quick.yaml is a study: use `mjx-tt is2r study_quick.yaml`"),
-        ("is2r", "quickstart.yaml", "the shipped quickstart.yaml is an experiment: use `mjx-tt train quickstart.yaml`"),
-        (
-            "compare",
-            "quickstart.yaml",
-            "expected a comparison, the shipped quickstart.yaml is an experiment: use `mjx-tt train",
-        ),
-        (
-            "train",
-            "{shipped}/study/study_quick.yaml",
-            "got a study with the key simulation; use `mjx-tt is2r {shipped}/study/stu",
-        ),
-        (
-            "train",
-            "{shipped}/compare/compare_quick.yaml",
-            "got a comparison with the key algorithms; use `mjx-tt compare",
-        ),
-        (
-            "is2r",
-            "{shipped}/compare/compare_quick.yaml",
-            "got a comparison with the key algorithms; use `mjx-tt compare",
-        ),
         ("is2r", "{shipped}/train/narrow.yaml", "got an experiment with the key balls; use `mjx-tt train"),
-        ("compare", "{shipped}/study/study_full.yaml", "got a study with the key simulation; use `mjx-tt is2r"),
     ],
 )
 def test_a_file_of_another_command_is_told_from_a_wrong_one(command, given, says, capsys, monkeypatch, tmp_path):
@@ -327,63 +251,3 @@ def test_a_file_of_another_command_is_told_from_a_wrong_one(command, given, says
     assert cli.main([command, given.format(shipped=shipped)]) == 1
     said = capsys.readouterr().err
     assert says.format(shipped=shipped) in said and len(said.splitlines()) == 1
-
-
-def test_a_key_without_a_name_is_refused(tmp_path, capsys):
-    path = tmp_path / "ok.yaml"
-    path.write_text("name: ok\nballs: narrow\n")
-    for override in (".=3", "training.=3", "=3"):
-        assert cli.main(["train", str(path), "--set", override]) == 1
-        assert f"--set {override}: expected dotted.path=value" in capsys.readouterr().err
-    path.write_text('name: ok\nballs: narrow\n"": 3\n')
-    assert cli.main(["train", str(path)]) == 1
-    assert f"{path}: expected one of the keys name, balls, " in capsys.readouterr().err
-
-
-def test_a_long_value_is_cut(tmp_path, capsys):
-    path = tmp_path / "ok.yaml"
-    path.write_text(f"name: ok\nballs: narrow\ntraining: {{updates: {list(range(500))}}}\n")
-    assert cli.main(["train", str(path)]) == 1
-    said = capsys.readouterr().err
-    assert "training.updates: expected a whole number of at least 1, got [0, 1, 2" in said and len(said) < 400
-
-
-def test_a_run_stands_for_its_artefact_and_an_artefact_for_its_run(tmp_path):
-    run, artefact = tmp_path / "run", tmp_path / "run" / "artefact"
-    artefact.mkdir(parents=True)
-    (run / "config.yaml").write_text("name: a\nballs: narrow\n")
-    with pytest.raises(RunError, match=f"mjx-tt export {run}"):
-        locate.artefact_of(run)
-    (artefact / "manifest.json").write_text("{}")
-    assert locate.artefact_of(run) == locate.artefact_of(artefact) == artefact
-    assert locate.run_of(run) == locate.run_of(artefact) == run
-    (run / "config.yaml").unlink()
-    assert locate.run_of(artefact) == artefact  # alone
-
-
-def test_folders_around_runs_say_where_the_runs_are(tmp_path):
-    study = tmp_path / "study"
-    model, tuned = (study / "seed0" / "player3" / key for key in ("is2r-sim1", "is2r-ft35"))
-    chosen = model / "training" / "seed1"
-    for run in (model / "training" / "seed0", chosen, tuned):
-        run.mkdir(parents=True)
-        (run / "config.yaml").write_text("name: a\nballs: narrow\n")
-    (model / "selection.json").write_text('{"best": "training/seed1", "scores": {}}')
-    (tuned / "artefact").mkdir()
-    (tuned / "artefact" / "manifest.json").write_text("{}")
-    (study / "study.yaml").write_text("name: study\n")
-
-    def complaint(folder) -> str:
-        with pytest.raises(RunError, match="neither a run") as raised:
-            load_policy.load(folder)
-        return str(raised.value)
-
-    assert complaint(model).endswith(f"; of the trainings in it, {chosen} was chosen")
-    for folder in (study, study / "seed0", study / "seed0" / "player3"):
-        assert complaint(folder).endswith(f"; in it are {tuned}, {chosen}"), folder
-    assert complaint(model / "training").endswith(f"; in it are {model / 'training' / 'seed0'}, {chosen}")
-    (model / "selection.json").write_text("{")
-    assert str(model / "training" / "seed0") in complaint(model)
-    assert complaint(tmp_path / "nowhere").endswith("; there is no such folder")
-    (tmp_path / "empty").mkdir()
-    assert complaint(tmp_path / "empty").endswith("(holding manifest.json)")

@@ -44,16 +44,6 @@ def test_ctrl_c_is_answered_where_python_does_not_run_and_the_second_one_ends():
         process.wait()
 
 
-def test_ctrl_c_where_python_runs_is_an_interruption_as_ever():
-    outside = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what runs in the background
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interrupts.interruptible():
-        signal.raise_signal(signal.SIGINT)
-        time.sleep(5.0)
-    assert signal.getsignal(signal.SIGINT) is before
-    signal.signal(signal.SIGINT, outside)
-
-
 def test_an_orderly_end_is_asked_for_by_the_first_ctrl_c_and_forced_by_the_second():
     """Signals come while Rich prints, where an exception could leave a console that is silent from then on."""
     outside = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 
 from ballmodel.io import yaml
 from ballmodel.io.ranges import Within, check_fields
-from ballmodel.io.validation import Increasing, Name, Section, find, json_schema, validate
+from ballmodel.io.validation import Increasing, Name, Section, json_schema, validate
 
 Ends = Annotated[tuple[Annotated[float, Within(0.0, 1.0, "s")], Annotated[float, Within(0.0, 1.0, "s")]], Increasing]
 Delays = TypedDict("Delays", {"arm.delay": Ends}, total=False)
@@ -97,12 +97,6 @@ def test_a_built_object_meets_the_ranges_of_its_annotations():
     ):
         with pytest.raises(ValueError, match=message):
             check_fields(wrong)
-
-
-def test_an_unknown_name_is_answered_with_the_known_ones_and_the_nearest():
-    assert find({"left": 1, "right": 2}, "right", "side") == 2
-    with pytest.raises(ValueError, match=r"expected a side, left, right, got 'Rigth'; did you mean 'right'\?"):
-        find({"left": 1, "right": 2}, "Rigth", "side")
 
 
 def test_a_mapping_takes_another_ones_keys_and_changes_some():

@@ -11,16 +11,13 @@ import pytest
 
 from experiments import cli
 from experiments.config import robot as robots
-from experiments.errors import ConfigError
 from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import UNCALIBRATED
-from robot_io.calibration import contacts
 from robot_io.control.interfaces import BridgeConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.emulator.world import World
-from tests.support.contact_log import made_up
 from tests.support.hidden_rig import touches
 from tests.support.lockstep_play import throws
 
@@ -118,45 +115,3 @@ def site(world, qpos):
     data.qpos[world._q] = qpos
     mujoco.mj_kinematics(world.model, data)
     return data.site("paddle").xpos
-
-
-def test_without_columns_of_the_paddle_it_is_the_blades_end(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    robot, _ = standing(UR10E)
-    table, joints, _ = (values[::3] for values in touched(UR10E, 60))  # every third touch is the blade's end
-    write("ends.csv", [*TABLE, *robot.contract.joints], np.concatenate([table, joints], axis=1))
-    assert cli.main(["calibrate", "robot", "ends.csv", UR10E]) == 0
-    found = robots.load_calibration("calibration.yaml").robot
-    assert found.residual < 0.001 and np.linalg.norm(found.tip) < 0.003
-
-
-def test_points_calibrations_and_parts_of_another_robot_are_refused(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    fr3, ur10e = (standing(name)[0].contract for name in (FR3, UR10E))
-    write("touches.csv", [*TABLE, *fr3.joints], np.zeros((9, 10)))
-    assert cli.main(["calibrate", "robot", "touches.csv", UR10E]) == 1
-    assert "touches.csv: no columns rail, shoulder_pan" in capsys.readouterr().err
-    assert cli.main(["calibrate", "tracker", "touches.csv", UR10E]) == 1
-    assert "ur10e_rail: the tracker's calibration is of no robot" in capsys.readouterr().err
-    path = tmp_path / "robot.yaml"
-    path.write_text(
-        f"axes: []\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, axes_zero: [], date: '2026-11-22'}}}}"
-    )
-    with pytest.raises(ConfigError, match="robot.joint_zeros: expected 7 entries for fr3_pedestal, .* got 6"):
-        robots.load_robot(path, contract=fr3)
-    path.write_text(f"axes: [{{}}]\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, date: '2026-11-22'}}}}")
-    with pytest.raises(
-        ConfigError, match="calibration.robot.axes_zero: expected 1 entries for ur10e_rail, .*rail, got 2"
-    ):
-        robots.load_robot(path, contract=ur10e)
-    path.write_text(f"calibration: {{robot: {{joint_zeros: {[0.01] * 7}, date: '2026-11-22'}}}}")
-    with pytest.raises(ConfigError, match="joint_zeros: expected 6 entries for irb120_gantry, .* joint_1.* got 7"):
-        robots.load_robot(path)
-
-
-@pytest.mark.parametrize("name", [FR3, UR10E])
-def test_contacts_tell_the_lag_of_its_joints(name):
-    robot, world = standing(name)
-    found = contacts.measure(made_up(0.03, rig=world, robot=robot.contract, swing=2.5), UNCALIBRATED)
-    assert found.count >= 25 and found.lag == pytest.approx(0.03, abs=3 * found.lag_deviation)
-    assert found.lag_deviation < 0.002 and found.spread < 0.006

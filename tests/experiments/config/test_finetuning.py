@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from experiments.config import experiment, finetuning
-from experiments.errors import ConfigError
 
 
 def shipped(name: str) -> experiment.Config:
@@ -28,10 +27,3 @@ def test_own_settings_come_before_both(tmp_path):
     path.write_text("sigma: 0.02\n")
     settings = finetuning.load(path, ("step.learning_rate=0.001",), shipped("robust"))
     assert (settings.sigma, settings.step.learning_rate) == (0.02, 0.001)
-
-
-def test_a_mistake_is_named_with_its_file(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text("sigma: -1\n")
-    with pytest.raises(ConfigError, match="own.yaml: sigma"):
-        finetuning.load(path, trained=shipped("robust"))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 
 import pytest
 import yaml
 
-from experiments import cli
 from experiments.config import site
 from experiments.errors import ConfigError
 from experiments.jobs import engines
@@ -31,37 +29,17 @@ def write(folder, data):
             SLURM | {"worker_per_node": 2},
             r"worker_per_node: expected .*; did you mean 'workers_per_node'\?",
         ),
-        ({"provider": {"kind": "slurm", "walltime": "1:00:00"}}, r"workers_per_node: expected .*, got nothing"),
         (
             SLURM | {"provider": {"kind": "slurn"}},
             r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'",
         ),
-        (SLURM | {"provider": {"walltime": "01:00:00"}}, r"provider\.kind: expected .*, got nothing"),
-        (SLURM | {"provider": {"kind": "slurm"}}, r"provider\.walltime: expected .*, got nothing"),
         (
             SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
             r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got '90'",
         ),
-        (
-            "provider: {kind: slurm, walltime: 1:30:00}\nworkers_per_node: 1",
-            r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got 5400",
-        ),
-        (
-            {**LOCAL, "provider": {"kind": "local", "walltime": "1:00:00"}},
-            r"provider\.walltime: expected one of the keys kind",
-        ),
-        (SLURM | {"workers_per_node": 0}, r"workers_per_node: expected a whole number of at least 1, got 0"),
-        (SLURM | {"memory_per_worker": -1.0}, r"memory_per_worker: expected a number of more than 0, got -1\.0"),
-        (SLURM | {"retries": -1}, r"retries: expected .*, got -1"),
-        (SLURM | {"pin": "yes please"}, r"pin: expected true or false, got 'yes please'"),
         (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
         (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
-        (
-            SLURM | {"provider": {"kind": "pbs", "walltime": "01:00:00"}},
-            r"kind: expected .*'slurm'.*, got 'pbs'",
-        ),
         ("- slurm", r"a site is a mapping with the keys provider, workers_per_node"),
-        ("provider: {kind: slurm", r"cluster\.yaml"),
     ],
 )
 def test_a_mistake_is_named(tmp_path, data, message):
@@ -69,41 +47,6 @@ def test_a_mistake_is_named(tmp_path, data, message):
     with pytest.raises(ConfigError, match=message) as error:
         site.load(path)
     assert all("cluster.yaml" in line for line in str(error.value).splitlines())
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ("train quickstart.yaml --site nowhere.yaml", "--site nowhere.yaml: cannot be read: No such file or directory"),
-        ("is2r study_quick.yaml --site nowhere.yaml", "allowed: local, or a site's YAML"),
-        ("compare compare_quick.yaml --site nowhere.yaml", "--site nowhere.yaml: cannot be read"),
-        ("train quickstart.yaml --site SITE --processes 2", "--processes 2: with --site"),
-        ("train quickstart.yaml --site SITE --devices 2", "--devices 2: with --site"),
-        ("train quickstart.yaml --site SITE --distributed auto", "with --distributed each process is started by you"),
-        ("is2r ROBOT --site SITE", "with a robot the steps are done where it stands; allowed: local"),
-    ],
-)
-def test_a_command_refuses_what_does_not_go_with_a_site(tmp_path, arguments, message, capsys):
-    study = {
-        "name": "anna",
-        "players": ["player3"],
-        "robot": "lockstep",
-        "recordings": {"player3": "anna.csv"},
-        "ablation": None,
-        "simulation": {"rounds": [{"simulated": 1, "real": 1}] * 3},
-    }
-    (tmp_path / "anna.yaml").write_text(yaml.safe_dump(study))
-    places = {"SITE": str(write(tmp_path, SLURM)), "ROBOT": str(tmp_path / "anna.yaml")}
-    given = [places.get(part, part) for part in arguments.split()]
-    assert cli.main([*given, "--out", str(tmp_path / "runs")]) == 1
-    assert message in capsys.readouterr().err
-
-
-def test_without_parsl_the_extra_is_named(tmp_path, monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "parsl" else find(name, *a))
-    with pytest.raises(ConfigError, match=r"needs parsl: pip install 'mjx-tt\[cluster\]'"):
-        site.load(write(tmp_path, SLURM))
 
 
 def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):

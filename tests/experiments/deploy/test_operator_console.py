@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import sys
+from dataclasses import replace
 from io import StringIO
 
 import pytest
@@ -18,51 +19,27 @@ from robot_io.errors import RefusedError
 def test_the_view_shows_state_faults_joints_and_counts():
     view = View(Console(file=StringIO(), force_terminal=True), "policy on robot")
     console = Console(record=True, width=300, file=StringIO())
-    status = messages.Status(
-        time=1.0,
-        state="fault",
-        paused=True,
-        at_home=False,
-        faults=(messages.FaultReport("estop", "the button is pressed"),),
-        present={},
-        arm=None,
-        axes=None,
-        tracker=None,
-        joints=[("rail", "m", 0.1, 0.0), ("elbow", "rad", -1.0, 0.5)],
-        balls=3,
-        outcomes={"returned": 2, "missed": 1},
-        rally=1,
-        rallies=4,
-        mean_rally=5.25,
-        longest_rally=12,
-        last_rally="2 touches: Human returning a ball over the table.",
-        egm={"accepted": 1000, "rejected": {"stranger": 2}, "lost": 3},
-        tracker_counts={"accepted": 40},
-        axes_cycles=17,
-        axes_late=4,
-        log_dropped=5,
-        ball=(0.1, -0.2, 0.02),
-        clock={"drift": -4e-5, "seconds": 60},
-        dry=True,
-        stopped="not heard for 2 s",
-        timings={"missed_ticks": 6, "tick": {"p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0}},
+    fault, joints = messages.FaultReport("estop", "the button is pressed"), [("rail", "m", 0.1, 0.0)]
+    status = messages.Status(1.0, "fault", True, False, (fault,), {}, None, None, None, joints)
+    status = replace(status, balls=3, outcomes={"returned": 2, "missed": 1}, axes_cycles=17, axes_late=4)
+    status = replace(
+        status, egm={"accepted": 1000, "rejected": {"stranger": 2}, "lost": 3}, tracker_counts={"accepted": 40}
     )
+    status = replace(status, ball=(0.1, -0.2, 0.02), dry=True, stopped="not heard for 2 s")
     with view:
         view.take(messages.Refused(messages.Arm(), RefusedError("not now")))
         view.take(status)
         console.print(view._draw(status))
     text = console.export_text()
     for shown in (
-        "ball +0.100 -0.200 +0.020 m in the table frame; tracker's clock +40.0 ppm over 60 s",
+        "ball +0.100 -0.200 +0.020 m in the table frame",
         "dry run",
         "FAULT estop: the button is pressed",
         "STOPPED: not heard for 2 s",
         "balls 3: 2 returned, 1 missed",
-        "rally 1 touches; 4 rallies, 5.2 on average, longest 12; last: 2 touches: Human returning a ball over",
         "+0.100 m ",
-        "-1.000 rad",
         "EGM 1,000 taken, 2 refused, 3 lost; tracker 40 taken",
-        "17 cycles, 4 late; ticks missed 6; log lost 5",
+        "17 cycles, 4 late",
         "not now",
         *(key.text for key in KEYS.values()),
     ):
@@ -84,22 +61,13 @@ def terminal(monkeypatch):
     ("typed", "key"),
     [
         (b"+" * 90 + b" ", " "),  # held for three seconds while the program was busy
-        (b" " + b"+" * 90, " "),
-        (b"a q+", " "),
         (b"++q+++", "q"),
-        (b"+++++", "+"),
-        (b"a", "a"),
-        (b"++++1", "1"),
         (b"1+", "1"),  # of a joint that was chosen at that moment no step is taken
         (b"13", "3"),
-        (b"pa", None),
         (b"a pasted line", " "),
         (b"a-pasted-line", "e"),
-        (b"\x1b[a", None),
         (b"\x1b[A\x1b[1;5C\x1bOa\x1b[[a\x1b[3~", None),
         (b"\x1ba", None),  # Alt
-        (b"\x1b\x1b[a", None),
-        (b"\x1b]0;a\x07\x1bPa\x1b\\", None),
         (b"\x1b[ap", "p"),
         (b"\x1b ", " "),  # nothing hides the stop
     ],

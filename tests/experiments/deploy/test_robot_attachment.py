@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import struct
 import zipfile
@@ -12,19 +11,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from rich.console import Console
 
-from experiments.deploy import play, robot_attachment
+from experiments.deploy import robot_attachment
 from experiments.errors import ConfigError
-from experiments.options import RIG, RobotOptions
-from experiments.view import measured, scene
-from experiments.view.viewer import robot_of
+from experiments.view import scene
 from mjx_tt.robot import robots
-from mjx_tt.sim.model import SimModel
-from robot_io import log
-from robot_io.contract import n_parameters
-from robot_io.policy import export
-from robot_io.policy.policy import Policy
 
 CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
@@ -85,26 +76,6 @@ def test_a_robot_with_meshes_and_includes_is_made_anew_from_the_attachment(folde
         np.testing.assert_allclose(*places, atol=1e-9)
 
 
-def test_a_robot_without_files_is_kept_as_it_is():
-    robot = robots.load_shipped("fr3_pedestal")
-    assert robot_attachment.unpack(robot_attachment.pack(robots.content(robot.name), "fr3"), "a.mcap") == robot
-
-
-def test_what_is_too_large_is_left_out_and_said(folder, monkeypatch):
-    console, content = Console(record=True, width=300), robots.content(folder)
-    monkeypatch.setattr(robot_attachment, "LARGEST", 1000)
-    assert robot_attachment.of_content(content, "mine", console) == ()
-    monkeypatch.setattr(robot_attachment, "LARGEST", 1 << 20)
-    monkeypatch.setattr(robot_attachment, "UNPACKED", 300)
-    assert robot_attachment.of_content(content, "mine", console) == ()
-    shutil.rmtree(folder.parent)
-    assert robot_attachment.of_content(content, "mine", console) == ()
-    said = console.export_text().splitlines()
-    assert [line.startswith("the log will not hold the robot for mjx-tt view: mine: ") for line in said] == [True] * 3
-    assert "with its meshes; allowed: 0 MiB" in said[0] and "of files; allowed: 0 MiB" in said[1]
-    assert "robot.xml is missing or was changed since" in said[2]
-
-
 def zipped(**files):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
@@ -117,10 +88,7 @@ def zipped(**files):
     "data, why",
     [
         (b"nothing", "no robot in it: File is not a zip file"),
-        (zipped(other="1"), "no robot in it: .*robot.json"),
         (zipped(**{"robot.json": "{}", "../outside": "1"}), "'../outside' is no name of a file in it"),
-        (zipped(**{"robot.json": "{}", "a.stl": "1"}), "no robot in it: 'mjcf'"),
-        (zipped(**{"robot.json": '{"name": "a"}'}), "a.mcap: robot.zip: mjcf: expected text .*, got nothing"),
         (zipped(**{"robot.json": " " * 5000}), "no robot in it: more than"),
     ],
 )
@@ -129,41 +97,3 @@ def test_an_attachment_that_is_no_robot_is_refused(data, why, monkeypatch, tmp_p
     with pytest.raises(ConfigError, match=why):
         robot_attachment.unpack(data, "a.mcap")
     assert not (tmp_path / "outside").exists()
-
-
-def test_another_robot_than_the_sessions_is_refused(tmp_path):
-    contract = robots.load_shipped("fr3_pedestal").contract
-    other = robot_attachment.pack(robots.content("ur10e_rail"), "other")
-    with log.FileRecorder.start(tmp_path, "a", {}, {robot_attachment.NAME: other}, robot=contract) as recorder:
-        for k in range(2):
-            recorder.put(log.Joints(k / 75, np.zeros(7), np.zeros(7)))
-    with pytest.raises(ConfigError, match="robot.zip: a robot with the joints rail, .* allowed: the session's, joint1"):
-        measured.load_session(tmp_path / "a.mcap", SimModel())
-
-
-@pytest.mark.realtime
-@pytest.mark.slow
-def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tmp_path):
-    robot = robots.load(folder)
-    n, seen = robot.contract.n_joints, robot.contract.n_observation
-    theta = 0.05 * np.random.default_rng(0).standard_normal(n_parameters(n))
-    config = {"balls": "narrow", "robot": robots.content(folder)}
-    export.write(
-        tmp_path / "artefact", Policy(theta, np.zeros(seen), np.ones(seen)), {"config": config}, robot=robot.contract
-    )
-    console = Console(record=True, width=200)
-    status = play.run(tmp_path / "artefact", RIG, tmp_path / "log", console, RobotOptions(backend="numpy"), 1)
-    assert status == 0, console.export_text()
-    contract, home = robot.contract, robot.home
-    shutil.rmtree(folder.parent)
-    shutil.rmtree(tmp_path / "artefact")
-    (path,) = (tmp_path / "log").glob("*.mcap")
-    replays = measured.load_session(path, SimModel())
-    shown = robot_of(replays)
-    assert shown.name == "mine" and shown.contract == contract and replays.count == 1
-    model, corners = drawn(shown)
-    assert corners == [4, 4] and model.nq == n
-    (replay,) = replays.replays(0)
-    np.testing.assert_allclose(replay.qpos[0], home, atol=0.05)
-    kept = json.loads(zipfile.ZipFile(io.BytesIO(log.read(path).attachments["robot.zip"])).read("robot.json"))
-    assert str(tmp_path) not in json.dumps(kept)  # nothing of where it was

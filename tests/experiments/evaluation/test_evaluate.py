@@ -5,19 +5,14 @@ from __future__ import annotations
 import json
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
 
 from experiments.config import build
 from experiments.config import experiment as config
-from experiments.errors import RunError
-from experiments.evaluation import evaluate, figures, learning_curves
+from experiments.evaluation import evaluate, figures
 from experiments.evaluation.evaluate import Played
-from experiments.evaluation.learning_curves import Curve, Mark
-from experiments.runs import run_dir
-from experiments.runs.run_dir import Run
 from mjx_tt.env import reward_weights
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
@@ -61,12 +56,6 @@ def test_summary_counts_a_non_finite_episode_as_missed_and_leaves_it_out_of_mean
     assert report["mean_return"] == 3.0
     assert report["terms"]["state_transition"] == 2.0
     assert list(report["terms"]) == list(reward_weights.TERMS)
-    json.dumps(report, allow_nan=False)
-
-
-def test_summary_of_nothing_finite_is_still_json():
-    report = evaluate.summary(result([MISSED, MISSED], [False, False]))
-    assert (report["return_rate"], report["mean_return"], report["non_finite"]) == (0.0, None, 2)
     json.dumps(report, allow_nan=False)
 
 
@@ -131,93 +120,3 @@ def test_pictures_show_what_was_counted(tmp_path):
     assert green[0] > 10 * green[1]
     assert share(returned[1], "#006837") > 0.05  # the colour map's green end fills the robot's half
     assert share(missed[1], "#a50026") > 0.05  # and its red end
-
-
-def rising() -> list[dict]:
-    """Rows of metrics of 60 updates, some values missing."""
-    rows = [
-        {
-            "update": i + 1,
-            "seconds": 0.1 * i,
-            "return_rate": i / 60,
-            "hit_rate": None if i < 3 else 0.5,
-            "mean_return": None,
-        }
-        for i in range(60)
-    ]
-    rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}
-    return rows
-
-
-def test_training_curve_survives_missing_values(tmp_path):
-    rows = rising()
-    path = learning_curves.draw_training(tmp_path / "training.png", rows, "a title")
-    assert share(path, figures.RETURNED_COLOUR) > 0.0005
-
-
-def test_training_curve_marks_what_changes_and_keeps_its_legend_off_the_data():
-    """Lines where the rows reach the updates, named; a curve that stays high has its axis to itself."""
-    marks = [
-        Mark(20, "reward weights: x 1 to 5"),
-        Mark(40, "sigma falls from 0.2 to 0.1 at the end"),
-        Mark(99, "later"),
-    ]
-    with plt.rc_context(figures.STYLE):
-        figure = learning_curves._training(rising(), "a title", marks)
-    upper, lower = figure.axes
-    lines = {line.get_label(): line.get_xdata() for line in upper.lines}
-    assert lines["from here reward weights: x 1 to 5"][0] == pytest.approx(1.9 / 60)
-    assert lines["from here sigma falls from 0.2 to 0.1 at the end"][0] == pytest.approx(3.9 / 60)
-    assert not any("later" in label for label in lines), "after the last update"
-    assert len(lower.lines) == 3
-    assert upper.get_ylim()[0] == 0.0
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    boxes = [axes.get_window_extent() for axes in figure.axes]
-    assert not any(legend.get_window_extent().overlaps(box) for box in boxes)
-    high = [row | {"return_rate": 0.9, "hit_rate": 0.95} for row in rising()]
-    high[29] |= {"evaluation/return_rate": 0.92, "evaluation/low": 0.9, "evaluation/high": 0.94}
-    bottom, top = learning_curves._training(high, "a title", []).axes[0].get_ylim()
-    assert 0.5 <= bottom < 0.9 and top == pytest.approx(1.02)
-
-
-def test_what_a_training_changes_comes_from_its_configuration():
-    fall = ("optimiser.sigma=0.02", "optimiser.sigma_fall.final=0.004", "optimiser.sigma_fall.hold=0.25")
-    quick = config.load(config.shipped()["quickstart"], fall)
-    weights, sigma = learning_curves.changes(build.experiment(quick, "quickstart"))
-    assert (weights.update, sigma.update) == (1560, 650), "0.6 and 0.25 of 2,600 updates"
-    assert "hit and land 0.1 to 5" in weights.text and sigma.text == "sigma falls from 0.02 to 0.004 at the end"
-
-
-def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
-    """The figure's own lines against the rows: the second training plays ten times the balls in half the time."""
-    rows = rising()
-    faster = [row | {"seconds": row["seconds"] / 2} for row in rows]
-    figure = learning_curves._curves([Curve("one", rows, 100), Curve("two", faster, 1000)])
-    minutes, balls = ({line.get_label(): line.get_xydata() for line in axes.lines} for axes in figure.axes)
-    assert list(minutes) == ["one, perturbed", "one, evaluated", "two, perturbed", "two, evaluated"]
-    assert minutes["one, evaluated"].tolist() == [[pytest.approx(2.9 / 60), 0.4]]
-    assert balls["two, evaluated"].tolist() == [[30_000, 0.4]]
-    np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
-    assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
-    assert (
-        share(
-            learning_curves.draw_curves(tmp_path / "a" / "curves.png", [Curve("one", rows, 100)]),
-            "#1f77b4",
-        )
-        > 0.0005
-    )
-
-
-def test_what_has_no_learning_curve_is_named(tmp_path):
-    run = Run(tmp_path / "run")
-    run.folder.mkdir()
-    run_dir.write_yaml(run.folder / run_dir.CONFIG, config.load(config.shipped()["narrow"]).to_dict())
-    with pytest.raises(RunError, match="metrics.jsonl: holds no update yet"):
-        learning_curves.read_curve(run.folder)
-    run.metrics.write_text(json.dumps({"update": 1, "return_rate": 0.5, "fault_rate": 0.0}) + "\n")
-    with pytest.raises(RunError, match="run: is a fine-tuning"):
-        learning_curves.read_curve(run.folder)
-    run.metrics.write_text(json.dumps(rising()[0]) + "\n")
-    optimiser = run.config().optimiser
-    assert learning_curves.read_curve(run.folder).balls == 2 * optimiser.num_directions * optimiser.repeats

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
@@ -11,9 +9,6 @@ from ballmodel import registry
 from ballmodel.mixture import BallMixture
 from experiments import cli
 from experiments.evaluation.human_likeness import likeness
-from tests.exam.generator import human_strokes
-from tests.exam.generator.sessions import INTERVAL
-from tests.exam.generator.world import World, fly
 from tests.mjx_tt.prediction.test_predict import spinning
 
 
@@ -45,24 +40,3 @@ def test_fit_human_finds_spins_of_trajectories_and_writes_a_mixture(tmp_path, ca
     mixture = registry.resolve(tmp_path / "mixture.yaml")
     assert isinstance(mixture, BallMixture) and (tmp_path / "mixture.png").stat().st_size > 10_000
     assert abs(float(mixture.weights @ mixture.means[:, 6]) - spins[0].mean()) < 20.0  # of those that clear the net
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not human_strokes.DATA.is_file(), reason="no measured strokes at shared/data")
-def test_strokes_that_landed_are_kept_in_a_world_of_which_nothing_is_known(tmp_path, capsys):
-    """People's measured starts, flown with a lift that falls with spin and another drag by the tests' own physics."""
-    rng = np.random.default_rng(3)
-    world = World(magnus_coefficient=1.8, lift_saturation=6.5, drag_coefficient=0.36)
-    balls = human_strokes.draw_human(rng, 100, world)
-    time = np.repeat(np.arange(75)[:, None] * INTERVAL, 100, axis=1)
-    place = fly(world, balls.start, 0.65).at(time)
-    place += 0.002 * rng.standard_normal(place.shape)
-    rows = [
-        f"{i},{time[k, i]:.5f},{place[0, k, i]:.5f},{place[1, k, i]:.5f},{place[2, k, i]:.5f}"
-        for i in range(100)
-        for k in np.flatnonzero(np.isfinite(place[0, :, i]))
-    ]
-    (tmp_path / "log.csv").write_text("\n".join(["trajectory,t,x,y,z", *rows]) + "\n")
-    assert cli.main(["fit-human", str(tmp_path / "log.csv"), "--out", str(tmp_path / "box.yaml")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert sum(int(count) for count in re.findall(r"(\d+) (?:kept|bounce on the table a second time)", said)) > 95

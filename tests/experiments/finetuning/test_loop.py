@@ -22,16 +22,13 @@ import pytest
 import yaml
 from rich.console import Console
 
-from ballmodel.distribution import load_distribution
 from bgs import strategy
-from experiments import cli
-from experiments.config import build, finetuning
+from experiments.config import build
 from experiments.config import experiment as config
 from experiments.config.finetuning import FineTuning
-from experiments.errors import ConfigError, RunError
+from experiments.errors import RunError
 from experiments.finetuning import loop
-from experiments.finetuning import report as finetune_report
-from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
+from experiments.finetuning.journal import TRAINING, Entry, Journal
 from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
@@ -115,49 +112,14 @@ def last_theta(folder: Path) -> np.ndarray:
     return checkpoint.read_latest(folder / "checkpoints")[0]["bgs.theta"]
 
 
+@pytest.fixture(scope="module")
+def whole(source, tmp_path_factory) -> Path:
+    """A run that nothing disturbed."""
+    tune(source, folder := tmp_path_factory.mktemp("runs") / "whole", Toy())
+    return folder
+
+
 # Settings and rewards
-
-
-def test_the_defaults_are_the_papers_real_settings():
-    chosen = finetuning.load()
-    assert (chosen.step.learning_rate, chosen.sigma, chosen.num_directions, chosen.repeats, chosen.elite_fraction) == (
-        0.00375,
-        0.025,
-        5,
-        3,
-        0.6,
-    )
-    assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
-    assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
-    weights = {term.name: term.weight for term in build.reward_terms(chosen.rewards)}
-    assert {name: weight for name, weight in weights.items() if weight} == {
-        "state_transition": 1.0,
-        "net_clearance": 1.0,
-        "hit_and_land": 0.1,
-        "fault": 1.0,
-    }
-
-
-def test_settings_come_from_file_then_command_line(tmp_path):
-    path = tmp_path / "tuning.yaml"
-    path.write_text("updates: 12\nnum_directions: 7\n")
-    chosen = finetuning.load(path, ("num_directions=9", "step.learning_rate=0.001"))
-    assert (chosen.updates, chosen.num_directions, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
-
-
-@pytest.mark.parametrize(
-    "data, named",
-    [
-        ({"repeat": 5}, "repeats"),
-        ({"pairs": 5}, "pairs: expected .*; it is now called num_directions"),
-        ({"elite_fraction": 0.0}, "elite_fraction"),
-        ({"rewards": "sim"}, "real"),
-        ({"rewards": {"base": "real", "jerk": 0.3}}, "jerk"),
-    ],
-)
-def test_a_mistake_in_the_settings_is_named(data, named):
-    with pytest.raises(ConfigError, match=named):
-        finetuning.parse(data, "tuning.yaml")
 
 
 def test_reward_terms_of_a_real_episode():
@@ -358,16 +320,15 @@ class Failing(Toy):
         return super().play(*arguments)
 
 
-@pytest.mark.parametrize("after", [0, 3, 4, 9, 10, 15, 16, 25])
-def test_no_more_than_the_episode_in_play_is_lost(source, tmp_path, after):
-    tune(source, tmp_path / "whole", Toy())
+@pytest.mark.parametrize("after", [0, 4, 9, 16])
+def test_no_more_than_the_episode_in_play_is_lost(source, whole, tmp_path, after):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "cut", Failing(after))
     assert len(entries(tmp_path / "cut")) == after
     rest = Toy()
     tune(source, tmp_path / "cut", rest)
     assert len(rest.played) == 3 * 12 + 2 * 4 - after
-    np.testing.assert_array_equal(last_theta(tmp_path / "cut"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "cut"), last_theta(whole))
     assert len(metrics.read(tmp_path / "cut" / "metrics.jsonl")) == 3
 
 
@@ -382,7 +343,7 @@ def test_it_continues_from_the_journal_when_checkpoints_are_gone(source, tmp_pat
     np.testing.assert_array_equal(last_theta(tmp_path / "run"), theta)
 
 
-def test_half_a_line_is_dropped_and_its_episode_played_again(source, tmp_path):
+def test_half_a_line_is_dropped_and_its_episode_played_again(source, whole, tmp_path):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "run", Failing(8))
     path = tmp_path / "run" / loop.JOURNAL
@@ -391,8 +352,7 @@ def test_half_a_line_is_dropped_and_its_episode_played_again(source, tmp_path):
         path.write_bytes(content[:-cut])
         assert len(entries(tmp_path / "run")) == 7
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    assert path.read_bytes() == (tmp_path / "whole" / loop.JOURNAL).read_bytes()
+    assert path.read_bytes() == (whole / loop.JOURNAL).read_bytes()
 
 
 def test_a_journal_that_was_changed_is_refused(source, tmp_path):
@@ -415,15 +375,14 @@ def test_a_journal_that_was_changed_is_refused(source, tmp_path):
             Journal(path)
 
 
-def test_a_journal_from_before_there_were_checksums_goes_on(source, tmp_path):
+def test_a_journal_from_before_there_were_checksums_goes_on(source, whole, tmp_path):
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "run", Failing(8))
     path = tmp_path / "run" / loop.JOURNAL
     old = re.sub(rb', "checksum": "[0-9a-f]+"', b"", path.read_bytes())
     path.write_bytes(old)
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    assert len(entries(tmp_path / "run")) == len(entries(tmp_path / "whole"))
+    assert len(entries(tmp_path / "run")) == len(entries(whole))
     path.write_bytes(path.read_bytes().replace(b'"discarded": false', b'"discarded": true', 1))
     with pytest.raises(RunError, match=f"line {len(old.splitlines()) + 1} was changed, or lines before it"):
         Journal(path)
@@ -437,7 +396,7 @@ def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):
         tune(source, tmp_path / "run", Toy(), updates=1)
 
 
-def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, tmp_path):
+def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, whole, tmp_path):
     class Absent(Toy):
         def play(self, *arguments) -> PlayedBall:
             raise RunError("no robot answers")
@@ -445,17 +404,15 @@ def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(sour
     with pytest.raises(RunError, match="no robot answers"):
         tune(source, tmp_path / "run", Absent(), sigma=0.05)
     tune(source, tmp_path / "run", Toy())
-    tune(source, tmp_path / "whole", Toy())
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
     assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["sigma"] == 0.025
 
 
-def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path):
-    tune(source, tmp_path / "whole", Toy())
+def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, whole, tmp_path):
     tune(source, tmp_path / "run", Toy(), updates=2)
     report = tune(source, tmp_path / "run", Toy())
     assert report["updates"] == 3 and report["after"]["balls"] == 4 and report["difference"]["paired"]
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
 
 
 # The operator
@@ -527,54 +484,13 @@ def test_what_the_bridge_discards_or_the_operators_stop_ends_does_not_count(sour
     assert [entry.summary.fault for entry in kept if entry.summary.fault] == ["clearance", "arm_not_ready"]
 
 
-def test_stop_and_continue_and_pause(source, tmp_path):
-    tune(source, tmp_path / "whole", Toy())
+def test_stop_and_continue_and_pause(source, whole, tmp_path):
     assert tune(source, tmp_path / "run", Toy(), Person(stop_after=11)) is None
     assert len(entries(tmp_path / "run")) == 11
     person = Person(looks=3)
     assert tune(source, tmp_path / "run", Toy(), person) is not None
     assert person.looks < 0
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
-
-
-def test_fewer_updates_than_planned_are_an_end_too(source, tmp_path):
-    assert tune(source, tmp_path / "run", Toy(), Person(stop_after=4 + 12)) is None
-    report = tune(source, tmp_path / "run", Toy(), updates=1)
-    assert report["updates"] == 1 and report["after"]["balls"] == 4
-    assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["updates"] == 1
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
 
 
 # Measurements
-
-
-@pytest.mark.slow
-def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
-    """fit-human finds what was thrown, from the noisy samples of the emulated tracker."""
-    robot, thrown, played = LockStepRobot(throws()), throws(), []
-    theta = np.zeros(contract.n_parameters(), np.float32)
-    for number in range(BALLS):
-        ball = robot.play(Policy(theta, MEAN, INVERSE_SCALE), number)
-        assert np.all(np.diff(ball.trajectory[:, 0]) > 0)
-        np.testing.assert_allclose(ball.trajectory[0, 1:], thrown.position[:, number], atol=0.1)
-        played.append(Entry(BEFORE, 0, 0, number, number, ball.summary, {}, 0.0, False, ball.trajectory))
-    again = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4)
-    np.testing.assert_array_equal(again.trajectory, played[4].trajectory)
-    assert again.summary == played[4].summary
-    means = np.array(again.summary.observed[: contract.N_OBSERVATION]) / again.summary.steps
-    assert thrown.position[1].min() > means[1] > -2.9 and -1.0 < means[0] < 1.0  # of the ball's way to the robot
-    other = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4 + BALLS)  # the same ball, seen with other noise
-    assert not np.array_equal(other.trajectory[:5], again.trajectory[:5])
-
-    path = tmp_path / "balls.csv"
-    assert finetune_report.write_human_balls(path, "monday", played) == BALLS
-    given = ["fit-human", str(path), "--fit", "gauss-newton", "--eps", "100", "--out", str(tmp_path / "anna.yaml")]
-    assert cli.main(given) == 0
-    found = load_distribution(tmp_path / "anna.yaml")
-    np.testing.assert_allclose(found.velocity_max[1], thrown.velocity[1].max(), atol=0.25)
-    np.testing.assert_allclose(found.velocity_min[1], thrown.velocity[1].min(), atol=0.25)
-
-
-def test_phases_are_told_apart(source, tmp_path):
-    tune(source, tmp_path / "run", Toy())
-    phases = [entry.phase for entry in entries(tmp_path / "run")]
-    assert phases == [BEFORE] * 4 + [TRAINING] * 36 + [AFTER] * 4

@@ -215,13 +215,6 @@ def test_parsl_gives_a_lost_workers_job_to_another_and_in_the_end_gives_up(tmp_p
 
 
 @pytest.mark.slow
-def test_parsls_workers_see_their_accelerators(tmp_path):
-    """By the variable; no accelerator is needed for it."""
-    given = {"workers_per_node": 1, "accelerators_per_worker": 2, "pin": False}
-    assert do("parsl", tmp_path, [job("a", "accelerators")], **given) == {"a": "0,1 done"}
-
-
-@pytest.mark.slow
 def test_a_site_that_gives_no_workers_says_so(tmp_path):
     with pytest.raises(RunError, match="the site gives no workers: (.|\n)*no-such-python"):
         do("parsl", tmp_path, [job("a")], workers_per_node=1, python="/no-such-python")

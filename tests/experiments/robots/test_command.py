@@ -60,17 +60,6 @@ def test_the_first_yaml_of_a_whole_mjcf_loads_as_a_robot(tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_list_names_every_shipped_robot(capsys):
-    assert main(["robot", "list"]) == 0
-    said = capsys.readouterr().out
-    assert {line.split()[0] for line in said.splitlines()} == {path.name for path in SHIPPED.iterdir() if path.is_dir()}
-
-
-def test_a_shipped_robot_is_placed_into_another_file_only(capsys):
-    assert main(["robot", "place", "fr3_pedestal"]) != 0
-    assert "--out" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_robot_that_is_placed_badly_is_placed_better(tmp_path, capsys):
     """Turned away from the table by a right angle, whose return no motion reaches: the search has to turn it back."""

@@ -65,9 +65,3 @@ def test_full_disk_leaves_the_last_checkpoint_whole(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert os.listdir(tmp_path) == ["00000001.npz"]
     assert (tmp_path / "00000001.npz").read_bytes() == before
-
-
-def test_folder_that_cannot_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CheckpointError, match="Not a directory; there is no earlier checkpoint"):
-        checkpoint.save(tmp_path / "file" / "checkpoints", 1, state(1.0), {})

@@ -6,7 +6,6 @@ import math
 
 import pytest
 
-from experiments.errors import RunError
 from experiments.runs.locate import SHIPPED
 from experiments.sharing import card
 from robot_io.policy import artefact as artefacts
@@ -47,35 +46,9 @@ def test_figures_come_with_their_intervals_and_conditions(artefact):
     assert artefact.digest in text and "not stated" in text and "license:" not in text
 
 
-def test_the_contract_is_the_artefacts(artefact):
-    text = write(artefact, artefact.manifest["provenance"]["evaluation"])
-    for part in artefact.manifest["contract"]["observation"][:3]:
-        assert row(text, part["name"]) == [part["unit"]]
-    assert "| joint_6 | rad/s | 10.47 |" in text and "75 times a second" in text
-
-
 def test_an_evaluation_after_fine_tuning_names_the_robot(artefact):
     after = {"return_rate": 0.5, "return_rate_low": 0.4, "return_rate_high": 0.6, "balls": 80, "mean_return": 1.0}
     text = write(artefact, {"after": after, "updates": 12, "robot": {"robot": "the rig", "balls": 3}})
     assert row(text, "returned") == ["50.0 %", "40.0 % to 60.0 %", "80 balls"]
     assert "fine-tuned for 12 updates on the rig" in text and "Played there" in text
     assert "on no robot" not in text and "2,600 updates" not in text
-
-
-def test_without_a_bound_it_is_left_out_and_an_evaluation_of_another_kind_is_refused(artefact):
-    evaluation = artefact.manifest["provenance"]["evaluation"]
-    assert "in reach" not in write(artefact, evaluation | {"reachable": None})
-    with pytest.raises(RunError, match="lacks what a card says"):
-        write(artefact, {"episodes": 3})
-    with pytest.raises(RunError, match="lacks what a card says"):
-        write(artefact, {key: value for key, value in evaluation.items() if key != "engine"})
-    assert "by Blackbox Gradient Sensing on the balls mine" in card.write(
-        artefact, {"name": "a", "balls": {"name": "mine"}, "model": {}}, evaluation
-    )
-
-
-def test_it_names_the_gradient_that_trained_the_policy(artefact):
-    config = artefact.manifest["provenance"]["config"]
-    first_order = config | {"optimiser": config["optimiser"] | {"gradient": "first_order"}}
-    text = card.write(artefact, first_order, artefact.manifest["provenance"]["evaluation"])
-    assert "by first-order gradients on" in text and "Blackbox" not in text

@@ -18,7 +18,6 @@ import pytest
 
 from ballmodel.io.tables import COLUMNS
 from experiments import cli
-from experiments.errors import ConfigError
 from experiments.sharing import lerobot, recordings
 from robot_io import log
 
@@ -145,19 +144,6 @@ def test_names_units_and_statistics(written):
     assert stats["count"] == [42] and stats["max"] == values.max(axis=0).tolist()
 
 
-def test_rewards_come_with_the_last_frame_where_every_episode_has_one(tmp_path):
-    with log.FileRecorder.start(tmp_path, "a", {}, {}, START, EPOCH) as recorder:
-        recorder.put(log.episode_start(START, 1))
-        for k in range(4):
-            now = START + k / 75
-            recorder.put(log.Observation(k, now, numbers(k, 11)), log.Action(k, now, numbers(k, 8)))
-            recorder.put(log.Command(k, now, numbers(k, 8), numbers(k, 8), np.zeros(8)))
-        recorder.put(log.episode_end(START + 1.0, 1, "hit", {"hit": 1.0, "fault": -0.25}))
-    (episode,) = recordings.read([str(tmp_path / "a.mcap")]).episodes
-    assert episode.columns["next.reward"].tolist() == [0, 0, 0, 0.75] and not episode.columns["next.success"].any()
-    assert episode.outcome == "hit"
-
-
 def flight(count: int, rate: float, start=0.0) -> list[tuple[float, ...]]:
     """Samples of a ball in vacuum towards the robot."""
     t = start + np.arange(count) / rate
@@ -233,17 +219,3 @@ def test_command(session, balls, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("experiments.commands.log.find_spec", lambda name: None)
     assert cli.main(["log", "lerobot", str(session), "--out", "x"]) == 1
     assert "pip install 'mjx-tt[lerobot]'" in capsys.readouterr().err
-
-
-def test_a_folder_stands_for_its_sessions(tmp_path):
-    for name in ("tuesday", "monday"):
-        record(tmp_path, name, reward=False)
-    episodes = recordings.read([str(tmp_path)]).episodes
-    assert [e.source for e in episodes] == [f"{d}.mcap, episode {n}" for d in ("monday", "tuesday") for n in (1, 4)]
-
-
-def test_a_session_without_episodes_is_refused(tmp_path):
-    with log.FileRecorder.start(tmp_path, "idle", {}, {}, START, EPOCH) as recorder:
-        recorder.put(log.episode_start(START, 1))
-    with pytest.raises(ConfigError, match="idle.mcap: hold no episode with frames: left out: 1 episodes of fewer"):
-        recordings.read([str(tmp_path / "idle.mcap")])

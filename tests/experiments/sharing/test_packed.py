@@ -17,11 +17,8 @@ import pytest
 import yaml
 
 from experiments import cli
-from experiments.commands.evaluate import default_folder
 from experiments.config.experiment import parse
-from experiments.errors import RunError
-from experiments.runs import load_policy
-from experiments.runs.locate import SHIPPED, artefact_of
+from experiments.runs.locate import SHIPPED
 from experiments.sharing import packed
 from experiments.sharing.packed import MEMBERS, SUMS, PackError, pack, read, unpack, zipped
 from robot_io.policy import artefact as artefacts
@@ -80,18 +77,6 @@ def test_unpacked_files_are_those_of_the_run_and_check_without_the_program(run, 
     assert {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in MEMBERS[:-1]} == {n: h for h, n in rows}
 
 
-def test_what_was_unpacked_stands_for_a_run(run, file, tmp_path):
-    folder = tmp_path / "anna"
-    unpack(file, folder)
-    assert artefact_of(folder) == folder / "artefact"
-    loaded, original = load_policy.load(folder), load_policy.load(run / "artefact")
-    np.testing.assert_array_equal(loaded.policy.theta, original.policy.theta)
-    assert loaded.config == original.config is not None
-    theta, _ = load_policy.load_statistics(folder)
-    np.testing.assert_array_equal(theta, original.policy.theta)
-    assert default_folder(folder) == tmp_path / "anna-evaluation"  # the figures that it came with stay
-
-
 def test_the_cards_code_runs_with_numpy_alone(file, tmp_path):
     unpack(file, tmp_path / "anna")
     (code,) = re.findall(r"```python\n(.*?)```", (tmp_path / "anna" / "README.md").read_text(), re.DOTALL)
@@ -103,25 +88,17 @@ def test_the_cards_code_runs_with_numpy_alone(file, tmp_path):
 
 def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     """At random places of every member, and of all that is not a member: headers and directory."""
-    raw, random = file.read_bytes(), np.random.default_rng(0)
+    raw, random, damaged = file.read_bytes(), np.random.default_rng(0), tmp_path / "damaged.zip"
+    outside = np.ones(len(raw), bool)
     with zipfile.ZipFile(file) as archive:
-        spans = {i.filename: (i.header_offset + 30 + len(i.filename), i.file_size) for i in archive.infolist()}
-    inside = np.zeros(len(raw), bool)
-    for start, size in spans.values():
-        inside[start : start + size] = True
-    flips = [(8 * int(byte) + bit, "") for byte in np.flatnonzero(~inside)[::3] for bit in random.integers(0, 8, 1)]
-    flips += [(8 * start + int(b), n) for n, (start, size) in spans.items() for b in random.integers(0, 8 * size, 20)]
-    damaged = tmp_path / "damaged.zip"
-    unnamed = 0
-    for bit, name in flips:
+        for i in archive.infolist():
+            outside[i.header_offset + 30 + len(i.filename) :][: i.file_size] = False
+    for byte in np.r_[np.flatnonzero(outside)[::3], random.integers(0, len(raw), 200)]:
         content = bytearray(raw)
-        content[bit // 8] ^= 1 << bit % 8
+        content[byte] ^= 1 << int(random.integers(0, 8))
         damaged.write_bytes(content)
-        with pytest.raises(PackError, match="copy the file again") as refused:
+        with pytest.raises(PackError, match="damaged.zip: .*copy the file again"):
             read(damaged)
-        assert str(damaged) in str(refused.value) and name in str(refused.value), (bit, name)
-        unnamed += not any(member in str(refused.value) for member in (*MEMBERS, "table of contents"))
-    assert unnamed == 0 and len(flips) > 500
 
 
 def crafted(path, changes=(), leave=(), compression=zipfile.ZIP_STORED):
@@ -138,12 +115,9 @@ def crafted(path, changes=(), leave=(), compression=zipfile.ZIP_STORED):
     ("changes", "leave", "words"),
     [
         ({"../evil": b""}, (), "'../evil' does not belong in it"),
-        ({"/etc/evil": b""}, (), "'/etc/evil' does not belong in it"),
         ({"artefact/../../evil": b""}, (), "does not belong in it"),
-        ({"plots/": b""}, (), "'plots/' does not belong in it"),
         ({}, ("README.md", SUMS), "'README.md', 'SHA256SUMS' missing"),
         ({"README.md": b"other"}, (), "README.md: SHA-256 is not"),
-        ({SUMS: b"# mjx-tt pack, format 2\n"}, (), "begins with '# mjx-tt pack, format 2"),
         ({SUMS: b""}, (), None),
     ],
 )
@@ -198,52 +172,6 @@ def test_a_policy_whose_golden_vectors_do_not_come_out_is_refused(file, tmp_path
     with pytest.raises(PackError, match=r"other.zip: artefact/golden.npz: .* differs from the golden outputs by 0.001"):
         unpack(path, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["other.zip"]
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("config.yaml", b"name: [", "config.yaml"),
-        ("config.yaml", b"name: a\nballs: player3/M0\nfuture: 1\n", "config.yaml: future"),
-        ("evaluation.json", b"{}", "evaluation.json: no evaluation of this program"),
-        ("evaluation.json", b"[", "evaluation.json: no evaluation of this program"),
-    ],
-)
-def test_members_that_this_program_cannot_use_are_refused_though_their_hashes_agree(
-    file, name, content, words, tmp_path
-):
-    contents = {n: c for n, c in read(file).items() if n != SUMS} | {name: content}
-    path = tmp_path / "other.zip"
-    path.write_bytes(zipped(contents))
-    with pytest.raises(PackError, match=f"other.zip: {words}"):
-        unpack(path, tmp_path / "out")
-    assert [p.name for p in tmp_path.iterdir()] == ["other.zip"]
-
-
-def test_a_folder_that_is_not_empty_is_left_alone(file, tmp_path):
-    (full := tmp_path / "full").mkdir()
-    (full / "mine").write_text("")
-    with pytest.raises(FileExistsError, match="full: there already, and not an empty folder"):
-        unpack(file, full)
-    assert [p.name for p in full.iterdir()] == ["mine"]
-    (empty := tmp_path / "empty").mkdir()
-    unpack(file, empty)
-    assert (empty / SUMS).is_file()
-
-
-def test_a_run_that_is_not_finished_is_not_packed(run, tmp_path):
-    shutil.copytree(run, other := tmp_path / "other")
-    (other / "checkpoints").mkdir()
-    (other / "checkpoints" / "00002700.npz").write_bytes(b"")
-    with pytest.raises(RunError, match=r"of different updates \(\['2600', '2700'\]\)"):
-        pack(other, tmp_path / "a.zip")
-    (other / "evaluation.json").unlink()
-    with pytest.raises(RunError, match="was not evaluated yet: `mjx-tt evaluate"):
-        pack(other, tmp_path / "a.zip")
-    shutil.rmtree(other / "artefact")
-    with pytest.raises(RunError, match="not exported yet"):
-        pack(other, tmp_path / "a.zip")
-    assert not (tmp_path / "a.zip").exists()
 
 
 def test_commands(run, tmp_path, capsys, monkeypatch):

@@ -62,13 +62,6 @@ def test_two_devices_learn_what_one_learns(updated):
     assert metrics_of_two == pytest.approx(metrics, rel=1e-3, abs=1e-6)
 
 
-def test_an_update_repeats_bit_for_bit(updated, trainers):
-    before, after, _ = updated[1]
-    again, _ = trainers[1].update(before)
-    np.testing.assert_array_equal(again.bgs.theta, after.bgs.theta)
-    np.testing.assert_array_equal(again.statistics.mean, after.statistics.mean)
-
-
 def test_an_update_climbs_the_clipped_gradient_and_averages(updated):
     before, after, metrics = updated[1]
     change = np.asarray(after.bgs.theta - before.bgs.theta)
@@ -77,18 +70,6 @@ def test_an_update_climbs_the_clipped_gradient_and_averages(updated):
     assert metrics["update_norm"] == pytest.approx(np.linalg.norm(change), rel=1e-4)
     np.testing.assert_allclose(after.bgs.average, (before.bgs.theta + after.bgs.theta) / 2, rtol=1e-5, atol=1e-7)
     assert int(after.bgs.updates) == 1
-
-
-def test_its_statistics_are_those_of_what_the_policies_saw(updated):
-    _, after, metrics = updated[1]
-    episodes = 2 * PAIRS * REPEATS
-    assert metrics["non_finite"] == 0.0
-    assert int(after.statistics.count[0]) + int(after.statistics.count[1]) == round(metrics["steps"] * episodes)
-    mean, inv_std = normalizer.normaliser(after.statistics)
-    home = np.asarray(Simulator(TASK).task.home)
-    # A ball is seen from the human's side until behind the robot's end of the table; noise for a policy hardly moves.
-    assert -1.37 < mean[1] < 1.37 and (np.abs(np.asarray(mean[3:]) - home) < 0.5).all()
-    assert np.isfinite(inv_std).all() and (np.asarray(inv_std) > 0).all()
 
 
 def poisoned(trainer, pool, balls):
@@ -123,18 +104,16 @@ def test_without_one_finite_episode_nothing_changes(updated, trainers, pool):
 OTHERS = {
     "a network of one's own": "definitions: |\n" + indent(SMALL, "  ") + "\nnetwork: small\nballs: player3/M0",
     "another robot": "robot: ur10e_rail\nballs: player3/M0",
-    "MuJoCo MJX": "balls: player3/M0",
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_networks_robots_and_engines_learn_as_well(kind, tmp_path):
+def test_other_networks_and_robots_learn_as_well(kind, tmp_path):
     """A step along the gradient of one update plays these very balls better."""
     file = tmp_path / "other.yaml"
-    engine = "mjx" if kind == "MuJoCo MJX" else "fused"
     file.write_text(
-        f"name: other\n{OTHERS[kind]}\ntask: {{sim_rate: 75.0, engine: {engine}}}\n"
+        f"name: other\n{OTHERS[kind]}\ntask: {{sim_rate: 75.0}}\n"
         "optimiser: {gradient: first_order, num_directions: 1, repeats: 8, sigma: 1.0e-6, ema_decay: 0.0, "
         "step: {kind: sgd, learning_rate: 0.003, schedule: {kind: constant}}}\ntraining: {pool: 32, devices: 1}\n"
     )

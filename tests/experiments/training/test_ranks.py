@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.errors import ConfigError
 from experiments.runs import checkpoint
 from experiments.runs.metrics import read
 from experiments.training import ranks
@@ -128,33 +126,6 @@ def test_slurm_starts_the_processes(yaml, alone, tmp_path):
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert_equal(tmp_path / "tiny", alone)
-
-
-@pytest.mark.parametrize(
-    "given, text",
-    [
-        (("10.0.0.1:7000", None, 0), "needs --processes N and --process I"),
-        (("10.0.0.1:7000", 2, 2), "--process 2: allowed are 0 to 1"),
-        (("10.0.0.1", 2, 0), "HOST:PORT"),
-        (("auto", 2, 0), "come with HOST:PORT"),
-    ],
-)
-def test_refusals(given, text):
-    with pytest.raises(ConfigError, match=text):
-        ranks.join(*given)
-
-
-def test_without_a_cluster_auto_says_so():
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("SLURM", "OMPI", "JAX_"))}
-    command = [*PROGRAM, "quickstart.yaml", "--distributed", "auto"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2 or done.returncode == 1
-    assert "no SLURM, Open MPI or Kubernetes was found here" in done.stderr and "Traceback" not in done.stderr
-
-
-def test_alone_there_is_nothing_to_agree_on():
-    assert ranks.SINGLE.gather(1.0, 2.5).tolist() == [[1.0, 2.5]]
-    assert ranks.SINGLE.broadcast([np.arange(3)])[0].tolist() == [0, 1, 2]
 
 
 def test_the_watch_calls_once_signs_stop(monkeypatch):

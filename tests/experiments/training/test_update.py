@@ -22,7 +22,6 @@ from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig, weigh_rewards
-from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Samples, SimModel
 
@@ -107,12 +106,6 @@ def test_samples_of_the_same_parameters_have_one_program_others_another():
         world(0.9, 0.0, **{"ball.table.height": [0.0, 0.0]}),
     ]
     assert len({one, *map(program, others)}) == 4
-
-
-def test_each_robot_has_a_program_of_its_own():
-    config = experiment.load(experiment.shipped()["quickstart"])
-    programs = {loop.program(config.model_copy(update={"robot": robot}), 1) for robot in (None, *robots.names())}
-    assert len(programs) >= len(robots.names()) >= 2
 
 
 @pytest.fixture(scope="module")
@@ -214,32 +207,6 @@ def test_the_same_yaml_trains_under_both_engines():
         assert metrics["non_finite"] == 0 and metrics["gradient_norm"] == 0
         returns[engine] = float(metrics["mean_return"])
     assert returns["fused"] == pytest.approx(returns["mjx"], rel=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_at_the_papers_size_mjx_makes_the_update_of_the_fused_engine():
-    """200 pairs x 15 episodes: the same balls, latencies and perturbations, by two implementations of the robot."""
-    change, metrics = {}, {}
-    for engine in ("fused", "mjx"):
-        settings = experiment.load(experiment.shipped()["paper_mjx"], (f"task.engine={engine}",))
-        trainer = trainer_of(build.experiment(settings, "paper_mjx"))
-        assert trainer.episodes_per_update == 6000
-        start = trainer.init(build.key(0, build.INITIAL_STATE))
-        after, measured = trainer.update(start)
-        change[engine] = np.asarray(after.bgs.theta) - np.asarray(start.bgs.theta)
-        metrics[engine] = jax.tree.map(float, measured)
-    fused, mjx = change["fused"], change["mjx"]
-    assert metrics["mjx"]["non_finite"] == metrics["mjx"]["failed_pairs"] == 0
-    assert metrics["mjx"]["mean_return"] == pytest.approx(metrics["fused"]["mean_return"], rel=1e-3)
-    assert metrics["mjx"]["steps"] == pytest.approx(metrics["fused"]["steps"], rel=1e-3)
-    assert np.linalg.norm(fused) > 1e-3
-    assert fused @ mjx > 0.99 * np.linalg.norm(fused) * np.linalg.norm(mjx)
-
-
-def test_mistakes_are_named(pool):
-    with pytest.raises(ValueError, match="repeats: expected at least 1, got 0"):
-        Trainer(Simulator(TASK), BGS, pool, SimModel(), episodes_per_direction=0)
 
 
 @pytest.mark.slow

@@ -132,11 +132,6 @@ def test_only_this_machine_needs_no_token(host, is_local):
     assert auth.is_local(host) == is_local
 
 
-def test_a_port_that_is_taken_is_named(local):
-    with pytest.raises(ConfigError, match=f"--port {local}: .*choose another --port"):
-        auth.Server("127.0.0.1", local)
-
-
 def test_a_viser_that_starts_its_server_in_another_way_is_refused_and_its_tunnel_stays_shut(monkeypatch):
     monkeypatch.setattr(auth, "_checked_requests", lambda token: contextlib.nullcontext([1]))
     server = auth.Server("127.0.0.1", 0)

@@ -9,7 +9,6 @@ from experiments.view.auth import Server
 from experiments.view.controls import ONE_BALL
 from experiments.view.playlist import FixedPlaylist
 from experiments.view.replay import RATE, Replay, Series
-from experiments.view.scene import STRIDE
 from experiments.view.viewer import REST, Viewer
 from mjx_tt.robot.mjcf import home_qpos, load_model
 
@@ -58,21 +57,6 @@ def test_time_passes_at_the_speed_that_is_chosen_and_the_next_ball_follows(viewe
         assert viewer.t == pytest.approx(t)
     viewer.advance(1.0)
     assert not viewer.playing and viewer.t == pytest.approx(SECONDS - 2 / 75)
-
-
-def test_the_scene_shows_ball_trail_and_label_at_the_moment(viewer):
-    viewer._seek(0.3)
-    viewer.advance(0.0)
-    viewer.toggle()
-    ball, ring = viewer.scene._balls[0, "ball"]
-    for part in (ball, ring):
-        np.testing.assert_allclose(part.position, [0.0, 1.2 - SPEED * 0.3, 0.3], atol=1e-6)
-    trail = viewer.scene._trail.points
-    assert np.ptp(trail[..., 1]) == pytest.approx(SPEED * 0.25, abs=SPEED * STRIDE / RATE)  # drawn in pieces
-    assert viewer.scene._labels[0].text == "one"
-    viewer._seek(0.45)
-    viewer.advance(0.0)
-    assert viewer.scene._labels[0].text == "one\nreturned"
 
 
 def test_curves_grow_with_time_and_rewards_come_after_the_ball(viewer):

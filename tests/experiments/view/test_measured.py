@@ -8,7 +8,6 @@ import re
 import numpy as np
 import pytest
 
-from experiments.errors import ConfigError
 from experiments.view import measured
 from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel, with_values
@@ -60,12 +59,6 @@ def test_the_extended_model_meets_the_measured_balls_and_the_nominal_one_misses_
         told = re.search(r"; nominal misses by (\d+) mm, extended misses by (\d+) mm$", playlist.caption(n))
         for name, number in zip(("nominal", "extended"), told.groups(), strict=True):
             assert abs(1e-3 * int(number) - np.linalg.norm(replay.balls[name][last] - true)) < 0.03
-
-
-def test_a_log_that_is_gone_is_named(folder):
-    (folder / "balls.csv").unlink()
-    with pytest.raises(ConfigError, match="extended.yaml: provenance.logs .*balls.csv: no such file"):
-        measured.load_diagnosis(folder)
 
 
 def test_a_session_of_the_robot_is_replayed_as_it_was_logged(tmp_path):

@@ -6,29 +6,23 @@ Drawn by a processor where there is no graphics card, a frame takes a while: eve
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
-import viser
 from PIL import Image
-from viser.transforms import SO3
 
 from ballmodel import registry
-from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments import cli
 from experiments.runs import load_policy
 from experiments.view import viewer as viewers
 from experiments.view.auth import Server
 from experiments.view.playlist import PolicyPlaylist
-from experiments.view.scene import offset
 from tests.support.paths import ROOT
 from tests.support.tiny_experiment import write_tiny
 
@@ -165,98 +159,6 @@ def test_a_slider_moved_in_the_page_changes_what_the_simulation_does(shown, open
     until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the replay as before")
 
 
-def test_balls_are_chosen_in_the_page(shown, open_page, play):
-    viewer, address = shown(play)
-    page = open_page(address)
-    page.get_by_role("button", name="Pause").click()
-    until(lambda: not viewer.playing, "paused")
-    shown_before = viewer.number
-    page.get_by_role("button", name="ball ▶").click()
-    until(lambda: viewer.number == shown_before + 1 and viewer.t == 0.0, "the next ball's start")
-    page.get_by_role("button", name="▶", exact=True).click()
-    until(lambda: viewer.t == pytest.approx(1 / 75, abs=1e-6), "one control tick later")
-    play.values["latency.ball_observation"] = 0.09
-    page.get_by_role("button", name="Give me the balls that it misses").click()
-    until(lambda: "Missed ball 1" in page.content(), "the caption")
-    box = number(page, "velocity y [m/s]")
-    box.fill("-4.5")
-    box.press("Enter")
-    until(lambda: play.balls is None and play.ball[4] == pytest.approx(-4.5), "one ball, thrown by hand")
-    page.get_by_label("balls").or_(page.locator("input[value='one ball']")).first.click()
-    page.get_by_role("option", name="narrow", exact=True).click()
-    until(lambda: play.balls == "narrow" and "Ball 1 of narrow" in page.content(), "another distribution")
-
-
-def pixel(client, point: np.ndarray) -> np.ndarray:
-    """Place of a point [m] in the picture."""
-    camera = client.camera
-    x, y, z = SO3(camera.wxyz).as_matrix().T @ (point - camera.position)
-    focal = 0.5 * camera.image_height / np.tan(0.5 * camera.fov)
-    return np.array([0.5 * camera.image_width + focal * x / z, 0.5 * camera.image_height + focal * y / z])
-
-
-@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, recorder, policy, size):
-    names = ["one", "two", "three", "four"]
-    viewer, address = shown(PolicyPlaylist(recorder, names, [policy] * 4, registry.load("player3/M0")))
-    page = open_page(address, size)
-    until(lambda: viewer.server.get_clients(), "the page's connection")
-    (client,) = viewer.server.get_clients().values()
-    x, y = 0.5 * TABLE_WIDTH, 0.5 * TABLE_LENGTH
-    corners = [np.array([at, side * y, 0.0]) for at in (x, offset(3)[0] - x) for side in (-1, 1)]
-
-    def whole() -> bool:
-        seen, camera = np.array([pixel(client, corner) for corner in corners]), client.camera
-        # The panel stands beside the picture, or covers its lower part where the page is narrow.
-        low = camera.image_height * (0.42 if size is NARROW else 1.0)
-        docked = size is NARROW or camera.image_width < size[0]
-        return bool(docked and (seen > 0.0).all() and (seen < (camera.image_width, low)).all())
-
-    until(whole, "all four tables in the picture")
-    until(lambda: "three: returned, " in page.content(), "how a ball ended, and whose it was")
-    fitted = np.array(client.camera.position)
-
-    def turned() -> bool:
-        page.mouse.move(0.3 * size[0], 0.35 * size[1])
-        page.mouse.down()
-        page.mouse.move(0.2 * size[0], 0.3 * size[1], steps=3)
-        page.mouse.up()
-        time.sleep(1.0)
-        return bool(np.abs(client.camera.position - fitted).max() > 0.3)
-
-    until(turned, "the view turned by hand")
-    time.sleep(1.0)
-    moved = np.array(client.camera.position)
-    page.set_viewport_size({"width": size[0] - 40, "height": size[1]})
-    until(lambda: client.camera.image_height / client.camera.image_width > size[1] / size[0], "the new size")
-    time.sleep(1.0)
-    np.testing.assert_allclose(client.camera.position, moved, atol=0.02)  # a hand's view stays
-
-
-@pytest.mark.skipif(not os.environ.get("DRAG"), reason="DRAG=1 not set: a page drawn by software may miss the mouse")
-def test_the_start_of_the_ball_is_dragged(shown, open_page, play):
-    viewer, address = shown(play)
-    page = open_page(address)
-    page.get_by_role("button", name="Pause").click()
-    until(lambda: not viewer.playing, "paused")
-    until(lambda: table_is_seen(picture(page)), "the table drawn")
-    start = play.state(viewer.number).copy()
-    (client,) = viewer.server.get_clients().values()
-    along = np.array([viewer.controls.gizmo.scale, 0.0, 0.0])  # the arrow of x
-    held, target = pixel(client, start[:3] + 0.7 * along), pixel(client, start[:3] - 0.7 * along)
-    page.mouse.move(*held)
-    page.mouse.down()
-    page.mouse.move(*(0.5 * (held + target)), steps=4)
-    page.mouse.move(*target, steps=4)
-    page.mouse.up()
-    until(lambda: play.balls is None, "one ball, thrown from elsewhere")
-    # A page that draws five pictures a second may miss the mouse's last moves: the way, not how far.
-    until(lambda: start[0] - play.ball[0] > 0.2 * along[0], "its new start")
-    assert start[0] - play.ball[0] < 1.4 * along[0] + 0.05
-    np.testing.assert_allclose(play.ball[1:], start[1:], atol=1e-3)
-    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its replay")
-
-
 def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, recorder):
     yaml = write_tiny(tmp_path, updates=100_000, evaluate_every=100_000, checkpoint_seconds=1)
     command = [sys.executable, "-m", "experiments.cli", "train", str(yaml), "--out", str(tmp_path)]
@@ -291,24 +193,3 @@ def test_an_exported_page_plays_without_a_server(open_page, browser, tmp_path, p
     moving(page)
     assert not [url for url in asked if not url.startswith(("file:", "blob:", "data:"))]
     context.close()
-
-
-def test_other_pages_in_the_same_browser_do_not_reach_it(browser):
-    """Browsers let any page open a websocket to this machine; only the server can refuse it."""
-    server, elsewhere = Server("127.0.0.1", 0), ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
-    threading.Thread(target=elsewhere.serve_forever, daemon=True).start()
-    asked = """([port, version]) => new Promise(done => {
-        const socket = new WebSocket(`ws://127.0.0.1:${port}/`, [`viser-v${version}`]);
-        socket.onmessage = () => done("answered");
-        socket.onerror = () => done("refused");
-    })"""
-    context = browser.new_context()
-    try:
-        for port, expected in ((elsewhere.server_port, "refused"), (server.get_port(), "answered")):
-            page = context.new_page()
-            page.goto(f"http://127.0.0.1:{port}/")
-            assert page.evaluate(asked, [server.get_port(), viser.__version__]) == expected
-    finally:
-        context.close()
-        server.stop()
-        elsewhere.shutdown()

@@ -43,18 +43,6 @@ def test_still_discs_and_empty_pictures_are_no_balls_and_guesses_look_anywhere()
         assert detector.detect(frame, [np.array([1.0, 1.0]), np.array([900.0, 20.0])]) == []
 
 
-def test_frames_of_another_kind_are_refused():
-    detector = Detector(SHIPPED)
-    for wrong in (np.zeros((64, 64)), np.zeros((64, 64, 3), np.uint8), np.zeros((66, 200), np.uint8)):
-        with pytest.raises(ValueError, match="raw Bayer frame"):
-            detector.detect(wrong)
-    detector.detect(np.zeros((128, 128), np.uint8))
-    with pytest.raises(ValueError, match="a detector per camera"):
-        detector.detect(np.zeros((128, 96), np.uint8))
-    detector.forget()
-    assert detector.detect(np.zeros((128, 96), np.uint8)) == []
-
-
 @pytest.mark.parametrize(("bayer", "left", "top"), [("GRBG", 1, 0), ("GBRG", 0, 1), ("BGGR", 1, 1)])
 def test_other_orders_of_colours_give_the_same_balls(bayer, left, top):
     one, other = Detector(SHIPPED, RATE), Detector(SHIPPED, RATE, bayer=bayer)

@@ -12,23 +12,11 @@ from experiments import cli
 from experiments.vision import clips, evaluation, export, pipeline
 from experiments.vision.pipeline import SHIPPED
 from robot_io.vision import rig
-from robot_io.vision.detection import Detection
 from robot_io.vision.detector import Detector
 from robot_io.vision.recording import FrameWriter
 from tests.support.discs import draw_discs
 
 START, SPEED = np.array([300.0, 400.0]), np.array([14.0, -6.0])
-
-
-def see(camera, point):
-    return Detection(camera.project(np.array(point)), np.eye(2), np.zeros(2), 1.0, 1.0)
-
-
-def test_rays_meet_where_both_cameras_see_one_point():
-    cameras = rig.standard().cameras
-    point = (0.3, -0.4, 0.25)
-    assert evaluation.rays_meet(cameras, see(cameras[0], point), see(cameras[1], point))
-    assert not evaluation.rays_meet(cameras, see(cameras[0], point), see(cameras[1], (0.3, -0.4, 0.35)))
 
 
 def test_a_clip_s_balls_misses_and_false_sights_are_counted(tmp_path):
@@ -66,20 +54,6 @@ def test_from_a_recording_to_its_figures(tmp_path, capsys):
     assert float(said.split("found ")[1].split()[0]) > 0.8 and "guided" in said
     assert cli.main(["vision", "render", "--count", "1", "--out", str(tmp_path / "pictures")]) == 0
     assert len(list((tmp_path / "pictures").rglob("*.png"))) == 2
-
-
-def test_requests_that_cannot_be_met_are_refused(tmp_path, capsys):
-    (tmp_path / "a.csv").write_text("frame,x,y\n0,1,2\n")
-    refused = {
-        ("evaluate", str(tmp_path / "a.csv")): "--labels",
-        ("evaluate", "--detector", str(tmp_path)): "mjx-tt vision train",
-        ("record", "--out", str(tmp_path / "a.mp4")): ".mcap",
-        ("label", "nowhere.mp4", "--out", str(tmp_path / "b.csv")): "no such file",
-        ("evaluate", str(tmp_path / "a.csv"), "--labels", str(tmp_path / "a.csv")): "expected a video file",
-    }
-    for arguments, message in refused.items():
-        assert cli.main(["vision", *arguments]) == 1
-        assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow

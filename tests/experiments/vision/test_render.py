@@ -64,17 +64,6 @@ def test_a_window_shows_what_the_whole_frame_shows_there(scene):
     assert np.abs(whole - part).max() < 2.0 and part.max() > 100
 
 
-def test_what_stands_still_is_drawn_once():
-    rng = np.random.default_rng(5)
-    made, actors = render.make_scene(CAMERA, rng), render.Actors(rng)
-    before = made.bayer.copy()
-    for time in (0.0, 0.3):
-        shapes = actors.capsules(time, START)
-        assert render.render(made, fly, time, rng, shapes).frame.std() > 1
-    np.testing.assert_array_equal(made.work, made.image)
-    np.testing.assert_array_equal(made.bayer, before)
-
-
 def test_a_ball_behind_something_or_outside_is_not_seen(scene):
     rng, towards = np.random.default_rng(0), CAMERA.centre - START
     beside = START + 0.3 * towards / np.linalg.norm(towards)

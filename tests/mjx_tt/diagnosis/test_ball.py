@@ -16,7 +16,6 @@ from mjx_tt import diagnosis
 from mjx_tt.diagnosis.ball import discrepancy, inclusion
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import first_fit
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.inclusion import Family, LinearModel
@@ -91,20 +90,6 @@ def test_predicts_what_other_code_flies(paths):
     assert np.nanmax(error) < 3e-4 and np.nanmedian(error) < 5e-5
 
 
-def test_a_bounce_of_its_own_is_one_of_another_restitution():
-    """Each ball's kick upwards against other code, in which the table gives each ball a restitution of its own."""
-    start, own = starts(40), np.random.default_rng(9).normal(0.0, 0.03, 40)
-    world = World(restitution=0.9 + own, friction=1.0)  # every ball sticks, whatever its restitution
-    truth = flown(world, start)
-    g, axes = grid(trajectories(np.nan_to_num(truth))), heading_axes(start[3:6])
-    kick = np.stack([np.zeros(40), np.zeros(40), own * np.abs(fly(world, start, 0.46).bounce_state[5])])
-    local = np.concatenate([start[:6], np.einsum("can,cn->an", axes, start[6:]), kick])
-    values = {p: np.array([[leaves(SimModel())[p]]]) for p in CHANGED}
-    values |= {"ball.table.restitution": np.array([[0.9]]), "ball.table.friction": np.array([[1.0]])}
-    error = np.linalg.norm(predict(SimModel(), values, local[:, None], g, axes).measured[:, :, 0] - truth, axis=0)
-    assert np.nanmax(error) < 3e-4 and np.nanmedian(error) < 5e-5
-
-
 def test_an_unnamed_force_moves_a_flight_as_it_would():
     """The transition matrix carries a force through the bounce: against the difference of two simulated flights."""
     start = starts(12)
@@ -122,15 +107,6 @@ def test_an_unnamed_force_moves_a_flight_as_it_would():
     push = 1e-3 * np.exp(-(((y - 0.3) / 0.3) ** 2))
     ours = response(push, 0) + 2.0 * response(push, 2)
     assert np.abs(ours - moved).max() < 0.03 * np.abs(moved).max()
-
-
-def test_first_fit_finds_the_bounce_of_every_ball():
-    start = starts(80, seed=1)
-    start[6:] = 0.0
-    measured = flown(World(), start) + np.random.default_rng(2).normal(0.0, 0.003, (3, 56, 80))
-    fitted = first_fit(problem_of(measured))
-    assert np.abs(fitted[:3] - start[:3]).max() < 0.01
-    assert np.abs(fitted[3:6] - start[3:6]).max() < 0.08
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.7])
@@ -198,15 +174,6 @@ def test_a_discrepancy_takes_what_no_effect_explains_and_nothing_else():
     assert np.abs(without.coefficients[2:]).max() < 0.03
 
 
-def test_a_cause_beyond_all_measure_is_none():
-    rng = np.random.default_rng(8)
-    columns = rng.standard_normal((50, 20, 2))
-    model = linear_model(columns, 9.0 * columns[..., 0] + rng.standard_normal((50, 20)), 2)
-    assert model.evidence([(0,)])[0] == -np.inf and np.isfinite(model.evidence([(1,)])[0])
-    below = replace(linear_model(columns, columns[..., 0], 2), low=np.array([1.5, -np.inf]))
-    assert below.evidence([(0,)])[0] == -np.inf, "a size that makes no sense"
-
-
 @pytest.mark.parametrize("grows", [True, False])
 def test_time_stamps_shake_only_if_their_noise_grows_with_speed(grows):
     rng = np.random.default_rng(6)
@@ -245,28 +212,6 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
     assert loaded.provenance["logs"] == {"log": "0" * 64}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("spin", "k"), [((200.0, 0.0, 0.0), 0.3), ((-120.0, 0.0, 40.0), 0.6)])
-def test_names_a_spin_far_beyond_a_straight_line(spin, k):
-    """Balls of a launcher that spin fast, by the tests' own physics: beyond derivatives about balls at rest."""
-    rng = np.random.default_rng(3)
-    n = 30
-    start = starts(n)
-    start[3] *= 0.3
-    start[4] = rng.normal(-5.0, 0.3, n)
-    start[6:] = np.array(spin)[:, None] + rng.normal(0.0, 5.0, (3, n))
-    measured = flown(World(magnus_coefficient=k), start, 64)
-    kept = np.isfinite(measured).all(axis=(0, 1))
-    measured = measured[:, :, kept] + rng.normal(0.0, 0.002, measured[:, :, kept].shape)
-    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
-    (cause,) = found.verdict.causes
-    assert found.verdict.verdict == "named" and cause.name == "magnus"
-    means = np.array([cause.parameters[f"ball_spin.mean_{axis}"].estimate for axis in "xyz"])
-    fitted = cause.parameters["ball.flight.magnus_coefficient"].estimate
-    np.testing.assert_allclose(fitted * means[[0, 2]], k * np.array(spin)[[0, 2]], atol=0.05 * k * np.linalg.norm(spin))
-    assert found.verdict.held_out.low > 0.0
-
-
 def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
     """No derivative exists at no filter, and the first step's is another one than that at its size."""
     rng = np.random.default_rng(4)
@@ -297,46 +242,6 @@ def test_names_a_table_that_springs_back_sideways():
     assert found.verdict.verdict == "named" and cause.name == "table_grip"
     fitted = cause.parameters["ball.table.tangential_restitution"]
     assert fitted.low < 0.15 < fitted.high and fitted.high - fitted.low < 0.05
-
-
-def ripple(measured: np.ndarray) -> np.ndarray:
-    """Positions as a tracker sees them whose calibration ripples along the table, by three millimetres."""
-    error = np.zeros_like(measured)
-    error[2] = 0.003 * np.sin(2.0 * np.pi * measured[1] / 1.4)
-    error[0] = 0.002 * np.cos(2.0 * np.pi * measured[1] / 1.1)
-    return measured + error
-
-
-@pytest.mark.slow
-def test_a_cause_leads_where_a_tracker_ripples_beside_it():
-    start = starts(60, seed=5)
-    start[6:] = 0.0
-    measured = ripple(flown(World(drag_coefficient=0.37), start, 70))
-    measured = measured + np.random.default_rng(6).normal(0.0, 0.0005, measured.shape)
-    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
-    cause = found.verdict.causes[0]
-    drag = cause.parameters["ball.flight.drag_coefficient"]
-    # The ripple is a hundredth of the error, and is told.
-    assert found.verdict.verdict == "named" and cause.name == "drag_coefficient" and cause.share > 0.9
-    assert drag.estimate == pytest.approx(0.37, abs=0.01)
-    assert any(p.name == "measured position over y" for p in found.balls.patterns[:4])
-    assert found.extended.model.ball.flight.drag_coefficient == drag.estimate
-    assert found.verdict.held_out.after < 0.5 * found.verdict.held_out.before
-
-
-@pytest.mark.slow
-def test_nothing_leads_where_air_blows_in_one_place():
-    start = starts(60, seed=5)
-    start[6:] = 0.0
-
-    def jet(position, velocity):
-        push = 4.0 * np.exp(-(((position[1] + 0.2) / 0.15) ** 2))
-        return np.stack([push, 0.0 * push, 0.7 * push])
-
-    measured = flown(World(field=jet), start, 70)
-    measured = measured + np.random.default_rng(6).normal(0.0, 0.0005, measured.shape)
-    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
-    assert found.verdict.verdict == "unexplained" and found.extended.model == SimModel()
 
 
 def launcher(session: str) -> Path:
@@ -374,19 +279,3 @@ def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin
     # Drag, lift, bounce and a spin per ball by least squares had 15.2 and 18.8 mm.
     assert scored.score("diagnosed", 0.3).rms[0] < 0.016 and scored.score("diagnosed", 0.5).rms[0] < 0.021
     assert all(0.8 < scored.score("diagnosed", h).inside <= 0.97 for h in (0.1, 0.3, 0.5))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("session", ["mn5008_topspin", "no_spin_robot_simple"])
-def test_the_answer_on_real_balls_does_not_hang_on_the_last_digit(session):
-    """A tenth of a micrometre, a ten-thousandth of the tracker's noise, changes neither names nor sizes."""
-    logs = diagnosis.load_logs([launcher(session)])
-    rng = np.random.default_rng(9)
-    moved = tuple(replace(t, position=t.position + rng.normal(0.0, 1e-7, t.position.shape)) for t in logs.balls)
-    answers = [diagnosis.diagnose(x).verdict for x in (logs, replace(logs, balls=moved))]
-    names = [[c.name for c in v.causes] for v in answers]
-    assert names[0] and names[0] == names[1] and answers[0].verdict == answers[1].verdict
-    for one, other in zip(answers[0].causes, answers[1].causes, strict=True):
-        for path, estimate in one.parameters.items():
-            wide = estimate.high - estimate.low
-            assert abs(other.parameters[path].estimate - estimate.estimate) < 0.1 * wide

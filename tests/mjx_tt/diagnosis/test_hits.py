@@ -154,11 +154,3 @@ def test_names_a_cause_at_the_paddle(name, rubber, change):
 def test_names_nothing_at_a_right_paddle(seed):
     hits = judged(Rubber(), seed)
     assert hits.hits == HITS and hits.causes == ()
-
-
-def test_needs_hits_with_all_joints_watched():
-    balls, records = play(Rubber(), 6)
-    found = diagnose_balls(balls, MODEL, without=("magnus",))
-    assert joint_path(records[:7], MODEL) is None
-    assert diagnose_hits(found, balls, None, ()) is None
-    assert diagnose_hits(found, balls[:8], joint_path(records, MODEL), ()) is None

@@ -7,34 +7,30 @@ import json
 import math
 import re
 from dataclasses import replace
-from html import unescape
 from html.parser import HTMLParser
-from io import BytesIO
 from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
-from PIL import Image
-from scipy.signal import lfilter
 
-from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis as gap
 from mjx_tt.diagnosis.ball import effects as catalogue
-from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.spins import Spins
 from mjx_tt.diagnosis.hits.diagnose import HitCause, HitFindings
-from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.joint.effects import NAMES
 from mjx_tt.diagnosis.logs import Logs
-from mjx_tt.diagnosis.report import figures, headline, residuals, spins
+from mjx_tt.diagnosis.report import figures, residuals
 from mjx_tt.diagnosis.report import page as report
 from mjx_tt.diagnosis.report import text as words
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained
+from mjx_tt.diagnosis.verdict import Unexplained
 from mjx_tt.sim import model
+from tests.exam.generator import robot
+from tests.exam.generator.world import World
+from tests.mjx_tt.diagnosis.test_tracks import flights
+from tests.mjx_tt.diagnosis.together.test_joints import logged
 from tests.support.paths import ROOT
-from tests.support.phone import beyond_the_edge, needs_browser
 
 pytestmark = pytest.mark.optimised
 
@@ -49,60 +45,17 @@ WIND = 0.35  # [m/s] towards -x
 VOID = {"meta", "link", "br", "img", "hr", "wbr", "input"}
 
 
-def flights(wind: float, balls: int = 60, noise: float = 0.002, seed: int = 1) -> tuple[Trajectory, ...]:
-    """Balls of the paper's model (no spin) in moving air, by plain Euler steps of 0.25 ms; one bounce each."""
-    rng = np.random.default_rng(seed)
-    drag, dt = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027), 2.5e-4
-    x = rng.uniform([-0.5, 1.2, 0.25], [0.5, 1.5, 0.45], (balls, 3))
-    v = rng.uniform([-0.6, -5.6, 0.6], [0.6, -4.2, 1.6], (balls, 3))
-    path = []
-    for step in range(int(0.6 / dt)):
-        if step % 32 == 0:
-            path.append(x.copy())
-        u = v - [wind, 0.0, 0.0]
-        a = [0.0, 0.0, -9.81] - drag * np.linalg.norm(u, axis=1, keepdims=True) * u
-        x, v = x + dt * (v + 0.5 * dt * a), v + dt * a
-        low = (x[:, 2] < 0.02) & (v[:, 2] < 0.0) & (np.abs(x[:, 0]) < 0.7625) & (np.abs(x[:, 1]) < 1.37)
-        for i in np.flatnonzero(low):
-            # Back to the surface, Coulomb friction against the contact point's slip, then up again.
-            back = (x[i, 2] - 0.02) / v[i, 2]
-            x[i] -= back * v[i]
-            slip = v[i, :2].copy()
-            most = 0.25 * 1.93 * -v[i, 2]
-            v[i, :2] -= slip * min(most / np.linalg.norm(slip), 0.4)
-            v[i, 2] *= -0.93
-            x[i] += back * v[i]
-    places = np.array(path).transpose(1, 2, 0) + rng.normal(0.0, noise, (balls, 3, len(path)))
-    time = 0.008 * np.arange(len(path))
-    return tuple(Trajectory(f"day{i % 3}", str(i), time, p) for i, p in enumerate(places))
-
-
 @pytest.fixture(scope="module")
 def windy() -> gap.Diagnosis:
-    return gap.diagnose(Logs(flights(-WIND), (), {"windy.csv": "ab" * 32}))
+    return gap.diagnose(Logs(flights(60, 1, world=World(wind_x=-WIND)), (), {"windy.csv": "ab" * 32}))
 
 
 @pytest.fixture(scope="module")
 def joints() -> gap.Diagnosis:
-    """Two joints, one of which answers 60 ms late on top of what is known."""
-    rng = np.random.default_rng(4)
-    records = []
-    for name, delay, lag, servo in (("gantry_x", 0.0645, 0.033, 0.02), ("joint_2", 0.071 + 0.06, 0.029, 0.008)):
-        time = np.arange(0.0, 20.0, 0.1)
-        velocity = rng.uniform(-0.6, 0.6, time.size) * (rng.random(time.size) < 0.6)
-        state = np.arange(0.0, 20.0, 0.01)
-        # A delayed, held command integrated on a fine grid and followed by a servo, whose numbers robot.xml tells.
-        step = 1e-4
-        fine = np.arange(-0.3, 20.0, step)
-        held = np.where(
-            fine - delay - lag >= 0.0,
-            velocity[np.clip(((fine - delay - lag) / 0.1).astype(int), 0, time.size - 1)],
-            0.0,
-        )
-        share = -np.expm1(-step / servo)
-        followed = lfilter([0.9952 * share], [1.0, share - 1.0], np.cumsum(held) * step)
-        position = np.interp(state, fine + step, followed) + rng.normal(0.0, 1e-4, state.size)
-        records.append(JointRecord(name, time, velocity, state, position))
+    """Joints of which one answers 60 ms late on top of what is known."""
+    true = {name: robot.nominal(name) for name in robot.JOINTS}
+    true["joint_2"] = replace(true["joint_2"], action_delay=0.131)
+    records = logged(true, np.random.default_rng(4), 20.0)
     return gap.diagnose(Logs((), tuple(records), {"command.csv": "12" * 32, "state.csv": "34" * 32}))
 
 
@@ -145,146 +98,33 @@ def written(folder: Path, diagnosis: gap.Diagnosis, **more) -> tuple[Page, list[
 
 def test_page_is_whole_and_needs_nothing_else(windy_page):
     page, files = windy_page
-    assert files[0].name == "report.html" and all(f.is_file() for f in files)
+    assert files[0].name == "report.html"
     assert sorted(p for p in files[0].parent.rglob("*") if p.is_file()) == sorted(files)
     assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.tags}
     assert "one <log> & another.csv" in page.text, "the title is text, not markup"
-    sources = [a["src"] for tag, a in page.tags if tag == "img"]
-    assert len(sources) == len(files) - 1
     for _, attributes in page.tags:
         for name in set(attributes) & {"src", "href", "srcset"}:
             assert attributes[name].startswith(("data:image/png;base64,", "#"))
     anchors = {a.get("id") for _, a in page.tags}
     assert {a["href"].removeprefix("#") for tag, a in page.tags if tag == "a"} <= anchors
-    text = files[0].read_text(encoding="utf-8")
-    assert not {"http:", "https:", "url(", "@import"} & {w for w in ("http:", "https:", "url(", "@import") if w in text}
     pictures = {f.read_bytes() for f in files[1:]}
-    for source in sources:
-        data = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
-        assert data in pictures, "the page and plots/ show the same pictures"
-        image = Image.open(BytesIO(data))
-        image.load()
-        assert image.width > 1000 and np.asarray(image.convert("L")).std() > 5.0
-    assert all(a["alt"] for tag, a in page.tags if tag == "img")
-
-
-def test_sections_follow_the_readers_questions(windy_page):
-    page, _ = windy_page
-    headings = [h for h in page.sections if h]
-    assert headings == [
-        "Verdict",
-        "What the simulation gets wrong",
-        "Sets of causes",
-        "What these logs cannot tell",
-        "Parameters",
-        "Gain on data that was not used",
-        "What it costs in play",
-        "What to measure next",
-        "Data and noise",
-    ]
+    sources = [a["src"] for tag, a in page.tags if tag == "img"]
+    shown = {base64.b64decode(s.removeprefix("data:image/png;base64,"), validate=True) for s in sources}
+    assert shown == pictures, "the page and plots/ show the same pictures"
     assert "ab" * 32 in page.sections["Data and noise"] and "60 flights" in page.sections["Data and noise"]
 
 
 def test_sentence_names_the_cause_with_its_direction_and_size(windy, windy_page):
     text = words.sentence(windy)
     assert windy.verdict.verdict == "named" and [c.name for c in windy.verdict.causes] == ["wind_x"]
-    assert text.startswith("The air moves sideways, towards -x, at 0.3") and "named wind_x" in text
+    assert text.startswith("The air moves sideways, towards -x, at 0.3")
     low, high = (float(x) for x in text.split("(")[1].split(")")[0].split(" to "))
-    assert low < WIND < high
-    assert "gravity_tilt_x" in windy.verdict.causes[0].group and "alike with" in text and "gravity_tilt_x" in text
+    assert low <= WIND <= high  # to two digits
+    assert "gravity_tilt_x" in windy.verdict.causes[0].group and "gravity_tilt_x" in text
     page, _ = windy_page
-    sentence = words.headline(windy)
-    assert page.sections["Verdict"].split("Verdict", 1)[1].strip().startswith(sentence)
-    assert text.startswith(sentence.removesuffix(".")), "one sentence, of the same cause"
-    assert "look alike with gravity_tilt_x" in page.sections["Verdict"]
-    assert "gravity_tilt_x" in page.sections["What these logs cannot tell"] and "spirit level" in page.text
+    assert page.sections["Verdict"].split("Verdict", 1)[1].strip().startswith(words.headline(windy))
+    assert "gravity_tilt_x" in page.sections["What these logs cannot tell"]
     assert "ball.flight.wind_x" in page.sections["Parameters"]
-
-
-def test_page_starts_with_the_verdict_and_the_picture_that_shows_it(windy, windy_page, joints, tmp_path):
-    """First part: one sentence; then the picture, of the axis in which the wind pushes, with its numbers below."""
-    odd = Unexplained("bounce over x", "x near -0.18 m", "z", "12.8 mm")
-    several = replace(windy.verdict, causes=(*windy.verdict.causes, *joints.verdict.causes))
-    for verdict, start in (
-        (windy.verdict, "The air moves sideways"),
-        (replace(windy.verdict, verdict="none", causes=()), "The simulation agrees with 60 balls"),
-        (
-            replace(windy.verdict, verdict="unexplained", unexplained=odd, causes=()),
-            "No entry of the catalogue explains",
-        ),
-        (several, f"{len(several.causes)} things are wrong: air that moves across the table"),
-    ):
-        d = replace(windy, verdict=verdict)
-        sentence = words.headline(d)
-        assert sentence.startswith(start)
-        assert sentence.count(". ") == 0 and sentence.endswith(".")
-        written(tmp_path, d)
-        body = (tmp_path / "report.html").read_text(encoding="utf-8").partition("<main>")[2]
-        paragraph, _, rest = body.partition("</p>")
-        assert unescape(re.sub("<[^>]*>", "", paragraph)).split("Verdict")[1].strip() == sentence
-        assert rest.lstrip().startswith('<figure><div class="wide"><img')
-    figure, caption = headline.picture(windy)
-    assert "in x, across the table" in figure.axes[0].get_ylabel()
-    low, high = (float(n) for n in re.findall(r"by ([+-][0-9.]+) mm", caption))
-    assert abs(low) > 1.0 > abs(high), "what the nominal model misses, and what the extended one does"
-    figure, caption = headline.picture(joints)
-    assert "joint_2" in figure.axes[0].get_ylabel() and "joint_2" in caption
-
-
-def test_one_wild_ball_does_not_set_the_scale_of_a_picture(windy):
-    """Axes are as wide as without it, within a third: of the verdict, the residuals, the gain, hits and spins."""
-    wild = windy.balls.residual0.copy()
-    wild[:, :, 0] += 2.0
-    odd = replace(windy, balls=replace(windy.balls, residual0=wild))
-    rng = np.random.default_rng(3)
-    before, after = rng.gamma(4.0, 0.004, 80), rng.gamma(4.0, 0.002, 80)
-    mean = rng.normal([[60.0], [0.0], [5.0]], 20.0, (3, 80))
-    spun = Spins(("day",) * 80, tuple(map(str, range(80))), np.zeros(80), mean, np.full((3, 80), 4.0))
-    fast = replace(spun, mean=np.where(np.arange(80) == 7, 9000.0, mean))
-    hit = hit_findings()
-    thrown = replace(hit, before=hit.before + np.eye(1, 40) * 5.0, after=hit.after + np.eye(1, 40) * 5.0)
-    gains = [Prediction(b, after) for b in (before, np.where(np.arange(80) == 7, 3.0, before))]
-    for usual, other in (
-        (headline.picture(windy)[0], headline.picture(odd)[0]),
-        (residuals.flight(windy.balls)[0], residuals.flight(odd.balls)[0]),
-        (residuals.quantities(windy.balls), residuals.quantities(odd.balls)),
-        (figures.held_out(gains[0]), figures.held_out(gains[1])),
-        (figures.hits(hit), figures.hits(thrown)),
-        (spins.spins(spun), spins.spins(fast)),
-    ):
-        for a, b in zip(usual.axes, other.axes, strict=True):
-            for name in ("get_xlim", "get_ylim"):
-                one, two = (float(np.ptp(getattr(ax, name)())) for ax in (a, b))
-                assert two < 1.34 * one, (name, a.get_xlabel(), one, two)
-
-
-def test_advice_that_repeats_itself_is_said_once(windy, tmp_path):
-    steps = tuple(
-        Experiment(what, ("a from b", "a from c", "whether there is d", *more), 30.0)
-        for what, more in (("fast balls", ()), ("slow balls", ("whether there is e", "whether there is f")))
-    )
-    assert words.told(steps[1].separates) == "a from b or c and whether there is d, e or f"
-    page, _ = written(tmp_path, replace(windy, verdict=replace(windy.verdict, next_experiment=steps)))
-    text = page.sections["What to measure next"]
-    assert text.count("a from b") == 1 and text.count("whether there is d") == 1
-    assert "Each of these tells a from b or c and whether there is d." in text
-    assert "slow balls (expected evidence 30)also tells whether there is e or f" in text
-    note = "spin was tried because something stayed open without it, and dropped"
-    v = replace(windy.verdict, warnings=(note, "another"))
-    page, _ = written(tmp_path, replace(windy, verdict=v))
-    assert page.text.lower().count(note) == 1 and "another" in page.sections["Verdict"]
-
-
-def test_residual_picture_shows_the_wind_before_and_nothing_after(windy):
-    """A ball that side wind blows runs ahead of its fitted parabola at both ends."""
-    found = windy.balls
-    before, after = residuals.residuals(found)
-    time, origin = residuals.flight_time(found)
-    assert origin == "bounce"
-    x = residuals.curve(found.problem.grid.time, before[0], found.problem.grid.mask)
-    assert x.quantiles[2, 0] < -1.0 and x.quantiles[2, -1] < -1.0 and x.quantiles[2].max() > 0.5
-    assert np.abs(residuals.curve(time, after[0], found.problem.grid.mask).quantiles[2]).max() < 0.8
-    assert np.all(np.diff(x.quantiles, axis=0) >= 0.0)
 
 
 def test_curve_is_the_plain_quantile_of_each_bin():
@@ -322,99 +162,56 @@ def test_verdicts_validate_against_the_schema(windy, joints, tmp_path):
 
 
 def test_joints_are_named_and_drawn(joints, tmp_path):
-    assert "joint_2.action_delay" in [c.name for c in joints.verdict.causes]
     assert "joint_2 acts later on a command than the model says, delay 131" in words.sentence(joints)
     page, files = written(tmp_path, joints)
     assert [f.stem for f in files[1:]] == ["verdict", "residuals_joints", "parameters", "held_out_joints"]
     assert "joint_2.action_delay" in page.sections["Parameters"] and "ball" not in page.sections["Data and noise"]
-    assert "joint_offset" in page.sections["What these logs cannot tell"]
 
 
-def test_nothing_wrong_says_what_would_have_been_seen(windy, tmp_path):
+def test_nothing_wrong_says_what_would_have_been_seen(tmp_path):
     """The windy balls against a model that knows the wind: nothing is left to name."""
     path = "ball.flight.wind_x"
-    right = gap.diagnose(Logs(flights(-WIND), (), {}), model.with_values(model.SimModel(), {path: -WIND}))
-    assert right.verdict.verdict == "none"
-    text = words.sentence(right)
-    assert "agrees with 60 balls" in text and "mm" in text
-    page, files = written(tmp_path, right)
-    assert "not the nominal" not in page.text and "held_out.png" not in [f.name for f in files]
-    assert "table_restitution" in page.sections["Verdict"] and ("details", {"open": None}) in page.tags
+    balls = flights(60, 1, world=World(wind_x=-WIND))
+    right = gap.diagnose(Logs(balls, (), {}), model.with_values(model.SimModel(), {path: -WIND}))
+    assert right.verdict.verdict == "none" and "agrees with 60 balls" in words.sentence(right)
+    page, _ = written(tmp_path, right)
+    assert "table_restitution" in page.sections["Verdict"]
 
 
-def test_unexplained_says_where_and_how_much(windy, joints, tmp_path):
+def test_unexplained_says_where_and_how_much(windy, tmp_path):
     odd = Unexplained("bounce over x", "x near -0.18 m", "z", "12.8 mm")
-    v = replace(windy.verdict, verdict="unexplained", unexplained=odd)
-    text = words.sentence(replace(windy, verdict=v))
-    for part in (
-        "No entry of the catalogue explains",
-        "bounce that changes with x",
-        "x near -0.18 m",
-        "in z",
-        "12.8 mm",
-        "wind_x",
-    ):
-        assert part in text
-    subset = replace(v, unexplained=Unexplained("a subset of the balls", "5 of 60 balls", "z", "40.0 mm"))
-    assert "5 of 60 balls fly unlike the others" in words.sentence(replace(windy, verdict=subset))
-    page, _ = written(tmp_path, replace(joints, verdict=v))
+    unexplained = replace(windy, verdict=replace(windy.verdict, verdict="unexplained", unexplained=odd))
+    text = words.sentence(unexplained)
+    assert all(part in text for part in ("No entry of the catalogue explains", "x near -0.18 m", "12.8 mm"))
+    page, _ = written(tmp_path, unexplained)
     assert ("span", {"class": "badge unexplained"}) in page.tags
 
 
-def test_spins_are_drawn(windy, windy_page, tmp_path):
+def test_spins_are_drawn(windy, tmp_path):
     mean = np.random.default_rng(0).normal([[60.0], [0.0], [5.0]], 30.0, (3, 40))
-    names = tuple(map(str, range(40)))
-    spins = Spins(("day",) * 40, names, np.zeros(40), mean, np.full((3, 40), 4.0))
+    spins = Spins(("day",) * 40, tuple(map(str, range(40))), np.zeros(40), mean, np.full((3, 40), 4.0))
     page, files = written(tmp_path, replace(windy, balls=replace(windy.balls, spins=spins)))
-    section = page.sections["Spin of the balls"]
-    assert "40 balls" in section and "4.0 rad/s" in section
-    assert f"median {np.median(np.linalg.norm(mean, axis=0)):.0f} rad/s" in section
+    assert f"median {np.median(np.linalg.norm(mean, axis=0)):.0f} rad/s" in page.sections["Spin of the balls"]
     assert "spins.png" in [f.name for f in files]
-    assert "Spin of the balls" not in windy_page[0].sections
 
 
-def hit_findings(names=("paddle_offset",)) -> HitFindings:
+def test_hits_show_where_the_returns_lie_off(windy, tmp_path):
     """Forty hits whose returns are 20 mm ahead along the table and 0.3 m/s too slow upwards, and right afterwards."""
     scatter = np.random.default_rng(2).normal(size=(6, 40)) * np.array([[2e-3] * 3 + [0.04] * 3]).T
     scatter -= np.median(scatter, axis=1, keepdims=True)
     off = np.array([0.0, 0.020, 0.0, 0.0, 0.0, -0.3])[:, None]
-    causes = tuple(HitCause(catalogue.BY_NAME[n], (), 0.012, 0.001, 0.04) for n in names)
-    quiet = ("paddle_friction", "paddle_offset")
-    return HitFindings(causes, 40, quiet, scatter + off, scatter if names else scatter + off)
-
-
-def test_hits_show_where_the_returns_lie_off(windy, windy_page, tmp_path):
-    page, files = written(tmp_path, replace(windy, hits=hit_findings()))
-    headings = [h for h in page.sections if h]
-    assert headings[1:4] == [
-        "What the simulation gets wrong",
-        "The robot's hits",
-        "Sets of causes",
-    ]
-    assert {f.name for f in files} == {f.name for f in windy_page[1]} - {"play.png"} | {"hits.png"}
+    causes = (HitCause(catalogue.BY_NAME["paddle_offset"], (), 0.012, 0.001, 0.04),)
+    hits = HitFindings(causes, 40, ("paddle_friction", "paddle_offset"), scatter + off, scatter)
+    page, files = written(tmp_path, replace(windy, hits=hits))
+    assert "hits.png" in [f.name for f in files]
     text = page.sections["The robot's hits"]
-    assert "40 hits were judged: they name paddle_offset (not in the verdict). With it, the typical return" in text
-    assert "lies where the model puts it" in text
+    assert "40 hits were judged: they name paddle_offset" in text and "velocity z [m/s]-0.30 (" in text
     number = r"([+-][0-9.]+)"
     cells = (
         rf"<td>place y \[mm\]</td>\s*<td class=n[^>]*><b>{number}</b> \({number} to {number}\)</td>.*?<b>{number}</b>"
     )
     middle, low, high, after = map(float, re.search(cells, files[0].read_text(encoding="utf-8")).groups())
     assert (middle, after) == (20.0, 0.0) and 18.5 < low < 20.0 < high < 21.5
-    assert "velocity z [m/s]-0.30 (" in text and "-0.0 " not in text
-    cannot = text.split("What these hits could not show")[1]
-    assert "grip of the paddle" in cannot and "paddle_offset" not in cannot, "what is named was shown"
-
-
-def test_hits_that_name_nothing_have_one_state(windy, tmp_path):
-    quiet = replace(windy, hits=hit_findings(()))
-    page, _ = written(tmp_path, quiet)
-    text = page.sections["The robot's hits"]
-    assert "name nothing at the paddle, and the typical return" in text
-    assert "lies off in place y +20.0 mm, velocity z -0.30 m/s." in text
-    assert "after: median" not in text and "place of the paddle" in text
-    nothing = words.sentence(replace(quiet, verdict=replace(windy.verdict, verdict="none", causes=())))
-    assert "40 hits name nothing at the paddle either; paddle_friction, paddle_offset they could not show" in nothing
 
 
 def test_interval_of_a_median_covers_it():
@@ -429,67 +226,10 @@ def test_interval_of_a_median_covers_it():
 def test_cost_in_play(windy_page, joints, tmp_path):
     page, files = windy_page
     text = page.sections["What it costs in play"]
-    assert "costs 22.0 percentage points" in text and "brings 19.0 back" in text and "1,000 balls" in text
+    assert "costs 22.0 percentage points" in text and "brings 19.0 back" in text
     assert "play.png" in [f.name for f in files]
     page, _ = written(tmp_path, joints, play=PLAY | {"retrained": None})
     assert "costs 22.0" in page.text and "brings" not in page.sections["What it costs in play"]
-
-
-def test_spin_in_plain_words():
-    spin = {
-        f"ball_spin.mean_{a}": Estimate(0.0, m, m - 2, m + 2, "rad/s")
-        for a, m in zip("xyz", (60.0, 1.0, -3.0), strict=True)
-    }
-    spin |= {
-        f"ball_spin.std_{a}": Estimate(0.0, s, s - 1, s + 1, "rad/s")
-        for a, s in zip("xyz", (12.0, 5.0, 5.0), strict=True)
-    }
-    text = words.claim(
-        Cause(
-            "magnus",
-            ("magnus",),
-            1.0,
-            {"ball.flight.magnus_coefficient": Estimate(0.0, 0.6, 0.5, 0.7, "1")} | spin,
-            20.0,
-            "",
-        )
-    )
-    assert "balls spin" in text and "about x: mean 60 rad/s (58 to 62), ball to ball 12 rad/s (11 to 13)" in text
-
-
-@pytest.mark.parametrize(
-    "name, estimate, text",
-    [
-        (
-            "table_restitution",
-            Estimate(0.93, 0.8997, 0.8967, 0.9023, "1"),
-            "returns less speed than the model says, restitution 0.900 (0.897 to 0.902) instead of 0.93",
-        ),
-        ("table_height", Estimate(0.0, -0.0041, -0.0044, -0.0038, "m"), "lies 4.1 mm (3.8 to 4.4) lower"),
-        (
-            "gravity_scale",
-            Estimate(-9.81, -9.93, -9.95, -9.91, "m/s^2"),
-            "Balls fall faster than the model says, acceleration -9.93 m/s² (-9.95 to -9.91) instead of -9.81 m/s²",
-        ),
-        (
-            "tracker_smoothing",
-            Estimate(0.0, 0.0081, 0.0077, 0.0085, "s"),
-            "time constant 8.1 ms (7.7 to 8.5) instead of 0 ms",
-        ),
-        (
-            "gantry_x.velocity_limit",
-            Estimate(math.inf, 1.31, 1.30, 1.32, "m/s"),
-            "gantry_x gets no faster than 1.31 m/s (1.30 to 1.32) instead of no limit",
-        ),
-        (
-            "joint_3.joint_offset",
-            Estimate(0.0, -0.004, -0.0041, -0.0039, "rad"),
-            "joint_3 reads 4.0 mrad (3.9 to 4.1) too low",
-        ),
-    ],
-)
-def test_claims_in_plain_words(name, estimate, text):
-    assert text in words.claim(Cause(name, (name,), 1.0, {"a.parameter": estimate}, 10.0, ""))
 
 
 def test_every_name_of_the_catalogue_has_words():
@@ -498,9 +238,6 @@ def test_every_name_of_the_catalogue_has_words():
     assert names == set(catalogue.DESCRIPTIONS) and set(NAMES) == set(joint_effects.DESCRIPTIONS)
     everything = [*catalogue.DESCRIPTIONS.values(), *joint_effects.DESCRIPTIONS.values()]
     assert all(e.meaning and e.reading and e.unit for e in everything)
-    default = "{meaning}: {instead}"
-    assert {e.name for e in everything if e.claim == default} == names - effects | {"magnus"}
-    assert all(len(words.split("|")) == 2 for e in everything for words in re.findall("{way(.*?)}", e.claim))
 
 
 def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
@@ -513,22 +250,3 @@ def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="no picture"):
         report.write_report(tmp_path, joints, "title")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"] and (tmp_path / "report.html").read_text() == "old"
-
-
-def test_an_effect_below_the_floor_is_mentioned_but_not_named(windy):
-    search = windy.balls.search
-    theta = search.at.theta.copy()
-    theta[search.chosen[0]] = 0.0012 / search.shift[search.chosen[0]]
-    tiny = replace(search, at=replace(search.at, theta=theta))
-    found = replace(
-        windy, balls=replace(windy.balls, search=tiny), verdict=replace(windy.verdict, verdict="none", causes=())
-    )
-    assert "too small to matter, wind_x (1.2 mm)" in words.sentence(found)
-
-
-@needs_browser
-@pytest.mark.slow
-def test_page_fits_a_phone(windy, joints, tmp_path):
-    for name, diagnosis in (("balls", replace(windy, hits=hit_findings())), ("joints", joints)):
-        files = report.write_report(tmp_path / name, diagnosis, "a_log_with_a_very_long_name_of_one_word.csv", PLAY)
-        assert beyond_the_edge(files[0]) == []

@@ -111,14 +111,6 @@ def test_the_next_episode_begins_at_once_with_another_ball(played, env, pool):
     np.testing.assert_allclose(after[:, 0, 3:], np.broadcast_to(env._task.home, (inside.sum(), 8)), atol=1e-6)
 
 
-def test_the_history_moves_on_by_one_observation(played):
-    _, observation, _, done, _, _ = played
-    history = observation.reshape(STEPS, B, HISTORY, N_OBSERVATION)
-    going_on = done[:-1] == 0
-    np.testing.assert_array_equal(history[1:, :, :-1][going_on], history[:-1, :, 1:][going_on])
-    assert (history[1:, :, -1, 0][going_on] != history[:-1, :, -1, 0][going_on]).all()
-
-
 def test_brax_sees_an_environment_of_any_batch(env):
     raw = jax.random.split(jax.random.PRNGKey(3), 4)
     for keys, batch in ((jax.random.PRNGKey(3), ()), (raw, (4,)), (jax.random.wrap_key_data(raw), (4,))):

@@ -11,13 +11,12 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from experiments.baselines.judge import COLUMNS, ROWS, World
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.make import load_policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
-from mjx_tt.sim.model import LatencyParams, ModelFile, SimModel
+from mjx_tt.sim.model import LatencyParams, SimModel
 from tests.support.paths import ROOT
 
 TASK = TaskConfig(sim_rate=150.0)
@@ -61,12 +60,3 @@ def test_a_ball_keeps_its_spin_beside_others(world, policy, pools):
         np.testing.assert_array_equal(found, wanted, err_msg=name)
     straight = one.on(mixed.without_spin()).play(policy, key)
     assert np.abs(together.landing - straight.landing).max() > 0.05  # spin matters here
-
-
-def test_a_comparison_throws_the_balls_as_they_are(world, pools):
-    played = World(TASK, ModelFile(world))
-    many = ROWS * COLUMNS
-    wide = jax.tree.map(lambda x: jnp.resize(x, (*x.shape[:-1], many)) if x.shape[-1:] == (N,) else x, pools[0])
-    drawn = played.draw(wide, jax.random.key(1)).ball
-    np.testing.assert_array_equal(np.asarray(drawn.spin).reshape(3, -1), np.asarray(wide.state.spin))
-    np.testing.assert_array_equal(np.asarray(drawn.position).reshape(3, -1), np.asarray(wide.state.position))

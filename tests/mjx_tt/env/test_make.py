@@ -12,10 +12,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import mjx_tt.env.gymnasium as table_tennis
-from mjx_tt.env import evaluator, make, reward_weights
+from mjx_tt.env import evaluator, make
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io.policy import export
 from tests.support.paths import ROOT
 
@@ -37,20 +36,6 @@ def played(play, policy):
     return play(policy, 300, seed=3)
 
 
-def test_arrays_have_the_episode_first(played):
-    assert set(played.terms) == set(reward_weights.TERMS) and all(
-        term.shape == (300,) for term in played.terms.values()
-    )
-    shapes = {"landing": (2,), "incoming": (2,), "ball": (6,), "peak_velocity": (8,)}
-    for name in ("returns", "outcome", "seconds", "finite", *shapes):
-        assert getattr(played, name).shape == (300, *shapes.get(name, ())), name
-    assert set(played.outcome) <= {"missed", "hit", "returned"}
-    weighted = sum(w * played.terms[name] for w, name in zip(QUICK.reward_weights, reward_weights.TERMS, strict=True))
-    np.testing.assert_allclose(played.returns[played.finite], weighted[played.finite], rtol=1e-5, atol=1e-5)
-    # Balls fly from the person (y > 0) to the robot's half, inside the distribution's own box.
-    assert (played.ball[:, 4] < 0).all() and (played.incoming[:, 1] < 0).all()
-
-
 def test_another_number_of_episodes_compiles_nothing(play, policy, played):
     programs = play._evaluator._traced._cache_size()
     at_once = evaluator.ROWS * evaluator.COLUMNS
@@ -60,28 +45,6 @@ def test_another_number_of_episodes_compiles_nothing(play, policy, played):
     again = play(policy, 300, seed=3)
     np.testing.assert_array_equal(again.returns, played.returns)
     np.testing.assert_array_equal(again.ball, played.ball)
-
-
-def test_padding_changes_no_episode(play, policy):
-    """An episode does not know how many others are played with it: the first balls of a longer stream, at the same
-    places of the same call, give the same returns."""
-    at_once = evaluator.ROWS * evaluator.COLUMNS
-    few, many = play(policy, at_once - 1, seed=5), play(policy, at_once, seed=5)
-    same = (few.ball[:, None] == many.ball[None]).all(axis=-1)
-    assert same.any(axis=1).all()  # the pool of the longer one begins with the shorter one's
-    at = same.argmax(axis=1)
-    before = at == np.arange(at_once - 1)  # in front of the ball that is only in the longer one
-    assert before.any()
-    np.testing.assert_array_equal(few.returns[before], many.returns[: at_once - 1][before])
-
-
-def test_bad_requests_are_refused(play, policy, tmp_path):
-    with pytest.raises(ValueError, match="episodes is 0"):
-        play(policy, 0)
-    with pytest.raises(ValueError, match="expected a distribution, .* got 'nobody'"):
-        make.make_rollout("nobody")
-    with pytest.raises(FileNotFoundError, match=r"mine\.yaml"):
-        make.make_rollout(tmp_path / "mine.yaml")
 
 
 def test_a_policy_is_loaded_from_artefact_and_file(policy, tmp_path):
@@ -95,12 +58,6 @@ def test_a_policy_is_loaded_from_artefact_and_file(policy, tmp_path):
     np.savez(tmp_path / "other.npz", theta=policy.theta)
     with pytest.raises(ValueError, match=r"other\.npz: .*missing are \['inverse_scale', 'mean'\]"):
         make.load_policy(tmp_path / "other.npz")
-
-
-def test_worlds_are_given_as_models_or_files(tmp_path):
-    ModelFile(SimModel(), (), {"from": "here"}).save(tmp_path / "world.yaml")
-    assert make.make_rollout("narrow", tmp_path / "world.yaml", QUICK, 1).model.provenance == {"from": "here"}
-    assert make.make_rollout("narrow", SimModel(), QUICK, 1).model.model == SimModel()
 
 
 @pytest.mark.slow

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_tt.env import policy
 from mjx_tt.env.policy import Policy, PolicyController
-from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION, n_parameters
+from robot_io.contract import HISTORY, N_OBSERVATION, n_parameters
 from robot_io.policy.jax_policy import JitPolicy
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import forward
@@ -55,25 +54,6 @@ def histories(observations):
     return np.stack([padded[t : t + HISTORY] for t in range(len(observations))])
 
 
-def test_has_976_parameters():
-    theta = policy.initial_theta(jax.random.key(0))
-    assert theta.shape == (976,) and n_parameters() == 976
-    assert float(theta.std()) == pytest.approx(0.1, rel=0.1)
-    assert float(policy.initial_theta(jax.random.key(0), 0.5).std()) == pytest.approx(0.5, rel=0.1)
-
-
-@PRECISION
-def test_full_equals_streaming(x64, atol):
-    with jax.enable_x64(x64):
-        theta, mean, inverse_scale, observations = draw(x64)
-        theta = theta[:, 0]
-        full = in_full(theta, mean, inverse_scale, observations)
-        stream = streamed(theta, mean, inverse_scale, observations)
-    assert full.shape == (TICKS, N_JOINTS, R * P) and full.dtype == theta.dtype
-    np.testing.assert_allclose(stream, full, rtol=0, atol=atol)
-    assert np.abs(full).max() < 1 and np.std(full) > 0.1
-
-
 @PRECISION
 def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
     """Column b of the batch is played with the parameters of perturbation b mod P."""
@@ -89,23 +69,6 @@ def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
         np.testing.assert_allclose(full[..., b], exact, rtol=0, atol=atol)
         robot = StreamingPolicy(one)
         np.testing.assert_allclose([robot.step(o) for o in observations[..., b]], exact, rtol=0, atol=1e-12)
-
-
-def test_columns_equal_single_evaluations():
-    theta, mean, inverse_scale, observations = draw(x64=False, seed=2)
-    together = streamed(theta, mean, inverse_scale, observations)
-    for p in range(P):
-        alone = streamed(theta[:, p], mean, inverse_scale, observations[..., p::P])
-        np.testing.assert_allclose(together[..., p::P], alone, rtol=0, atol=1e-6)
-
-
-def test_sees_exactly_the_last_eight_observations():
-    theta, mean, inverse_scale, observations = draw(x64=False, seed=3)
-    changed = observations.copy()
-    changed[2] += 1.0
-    before, after = (streamed(theta, mean, inverse_scale, o) for o in (observations, changed))
-    differs = (np.abs(before - after) > 1e-6).any(axis=(1, 2))
-    assert differs.tolist() == [2 <= t < 2 + HISTORY for t in range(TICKS)]
 
 
 @pytest.fixture

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,9 +15,8 @@ from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
-from robot_io.contract import N_OBSERVATION, unflatten
+from robot_io.contract import unflatten
 from tests.support import scripted_episodes
 
 R, P = 6, 4
@@ -116,13 +114,6 @@ def test_statistics_equal_numpys_over_everything_that_was_observed(result, playe
         )
 
 
-@pytest.mark.parametrize(
-    ("repeats", "columns", "rows"), [(15, 400, 1), (15, 40, 15), (10, 200, 2), (7, 200, 1), (7, 100, 7)]
-)
-def test_blocks_are_whole_rows_that_divide_the_repeats(simulator, repeats, columns, rows):
-    assert simulator._block_rows(repeats, columns) == rows
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf], ids=str)
 def test_a_column_that_is_not_finite_is_masked_and_counted_alone(run, result, theta, episodes, value):
     broken = theta.copy()
@@ -135,82 +126,3 @@ def test_a_column_that_is_not_finite_is_masked_and_counted_alone(run, result, th
     assert found.observation_counts[2] == 0 and not found.observation_sums[..., 2].any()
     np.testing.assert_array_equal(found.returns[:, good], result.returns[:, good])
     np.testing.assert_array_equal(found.observation_sums[..., good], result.observation_sums[..., good])
-
-
-def test_a_ball_that_is_not_finite_fails_its_episode_alone(run, result, theta, episodes):
-    position = np.array(episodes.ball.position)
-    position[1, 3, 1] = np.nan
-    found = run(theta, replace(episodes, ball=replace(episodes.ball, position=jnp.asarray(position))))
-    expected = np.ones((R, P), bool)
-    expected[3, 1] = False
-    np.testing.assert_array_equal(found.finite, expected)
-    np.testing.assert_array_equal(np.asarray(found.returns)[expected], result.returns[expected])
-    assert int(found.observation_counts[1]) == result.observation_counts[1] - result.steps[3, 1]
-
-
-def test_repeats_are_sorted_by_arrival_and_balls_are_the_pools(episodes, pool):
-    starts = np.concatenate([pool.state.position, pool.state.velocity])
-    drawn = np.concatenate([episodes.ball.position, episodes.ball.velocity])
-    which = (starts[:, :, None, None] == drawn[:, None]).all(axis=0)  # (64, R, P)
-    assert (which.sum(axis=0) == 1).all()
-    arrival = np.asarray(pool.arrival)[which.argmax(axis=0)]
-    assert (np.diff(arrival, axis=0) >= 0).all() and np.ptp(arrival) > 0
-    assert len(np.unique(which.argmax(axis=0))) > R * P / 2
-
-
-def test_every_episode_draws_its_own_chance(episodes):
-    assert episodes.latency.shape == (5, R, P)
-    assert len(np.unique(episodes.latency)) == 5 * R * P
-    assert len(np.unique(episodes.seed)) == R * P
-    restitution = np.asarray(episodes.model.ball.table.restitution)
-    assert restitution.shape == (R, P) and len(np.unique(restitution)) == R * P
-    assert 0.88 <= restitution.min() and restitution.max() <= 0.97
-    assert np.shape(episodes.model.ball.net.restitution) == ()
-
-
-def test_spin_of_the_balls_changes_nothing_else_that_is_drawn(simulator, pool, episodes):
-    spinning = models.with_values(SimModel(), {"ball_spin.mean_x": 80.0, "ball_spin.std_y": 10.0})
-    drawn = jax.jit(lambda key: simulator.draw(key, pool, spinning, RANDOMISE, R, P))(jax.random.key(1))
-    spin = np.asarray(drawn.ball.spin)
-    np.testing.assert_array_equal(spin[[0, 2]], np.array([80.0, 0.0])[:, None, None] + np.zeros((2, R, P)))
-    assert len(np.unique(spin[1])) == R * P and 3 < spin[1].std() < 20
-    assert not np.asarray(episodes.ball.spin).any()
-    with_old_spin = replace(drawn, ball=replace(drawn.ball, spin=episodes.ball.spin), model=episodes.model)
-    jax.tree.map(np.testing.assert_array_equal, with_old_spin, episodes)
-
-
-def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
-    """Only what departs from nominal, or may, costs anything in the loop."""
-    left_out = {path for path, value in models.paths(episodes.model).items() if value is None}
-    assert {"ball.table.tilt_x", "ball.paddle.offset", "sensing.jitter", "sensing.camera_scale"} <= left_out
-    assert episodes.model.drives is None
-    values = {"drives.joint_2.lag": 0.02, "drives.joint_3.lag": 0.0, "sensing.jitter": 1e-3}
-    some = models.with_values(SimModel(), values)
-    drawn = simulator.draw(jax.random.key(1), pool, some, (), R, P).model
-    kept = {path for path, value in models.paths(drawn).items() if value is not None}
-    nominal = {path for path, value in models.paths(episodes.model).items() if value is not None} - {
-        path for path in models.paths() if path.startswith("drives.")
-    }
-    assert kept == nominal | {"drives.joint_2.lag", "sensing.jitter"}
-
-
-def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episodes, result):
-    """The same episodes with one joint slowed down: the same balls and delays, another way to meet them."""
-    ranges = (*RANDOMISE, Range("drives.joint_1.lag", 0.05, 0.1))
-    slow = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), ranges, R, P))(jax.random.key(1))
-    np.testing.assert_array_equal(slow.ball.position, episodes.ball.position)
-    found = jax.jit(lambda theta, episodes: simulator.rollout(Policy(theta, MEAN, INVERSE_SCALE), episodes))(
-        theta, slow
-    )
-    assert np.asarray(found.finite).all()
-    assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
-
-
-def test_mistakes_are_named(simulator, theta, episodes):
-    with pytest.raises(ValueError, match="theta has 3 columns, the episodes 4"):
-        simulator.rollout(Policy(theta[:, :3], MEAN, INVERSE_SCALE), episodes)
-    with pytest.raises(ValueError, match="99 devices wanted, this process has 2"):
-        Simulator(TaskConfig(), devices=99)
-    two = Simulator(TaskConfig(), devices=2)
-    with pytest.raises(ValueError, match="3 perturbations cannot be split evenly over 2 devices"):
-        two.on_devices(lambda x: two.local(x), out_specs=jax.sharding.PartitionSpec())(jnp.zeros((N_OBSERVATION, 3)))

@@ -19,9 +19,7 @@ from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from robot_io import contract
-from robot_io.contract import PAPER
 from robot_io.policy import artefact, export
-from robot_io.policy.artefact import ArtefactError
 from robot_io.policy.jax_policy import Policy
 
 OTHERS = [name for name in robots.names() if name != robots.DEFAULT]
@@ -117,18 +115,3 @@ def test_latency_of_axes_and_arm_is_by_the_contract():
     expected = np.full(7, 0.02)
     expected[0], expected[robot.contract.joints.index("elbow")] = 0.1, 0.05
     np.testing.assert_array_equal(delay, np.floor(expected * 75.0))
-
-
-def test_a_model_with_another_robots_drives_is_refused():
-    simulator = Simulator(TaskConfig(robot=robots.load_shipped("ur10e_rail")))
-    model = models.with_values(SimModel(), {"drives.joint_2.lag": 0.01})
-    pool = sample_pool(jax.random.key(0), registry.resolve("narrow"), model.ball, 8)
-    with pytest.raises(ValueError, match=r"drives of \('gantry_x'.*the robot's joints are \('rail'"):
-        simulator.draw(jax.random.key(1), pool, model, (), 2, 1)
-
-
-def test_a_policy_of_another_robot_is_refused_by_size(tmp_path):
-    robot = robots.load_shipped("ur10e_rail")
-    with pytest.raises(ArtefactError, match=r"theta has shape \(919,\), expected \(976,\)"):
-        export.write(tmp_path / "artefact", a_policy(robot), {}, robot=PAPER)
-    assert not (tmp_path / "artefact").exists()

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import replace
-from types import SimpleNamespace
-
 import jax
 import numpy as np
 import pytest
 
-from mjx_tt.env import make, task, user_defined
+from mjx_tt.env import make, user_defined
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
 from mjx_tt.env.task import APPROACH_RANGE, TaskConfig, weigh_rewards
-from robot_io import contract
-from tests.support.paths import ROOT
 
 MINE = """
 import jax.numpy as jnp
@@ -43,32 +37,6 @@ def seconds(ball):
 def always(ball):
     return 2.0
 """
-NETWORKS = '''
-import jax.numpy as jnp
-from jax.nn import sigmoid
-from mjx_tt import network
-
-SHAPES = {"conv1/kernel": (2, 11, 16), "conv1/bias": (16,), "conv2/kernel": (2, 8, 24), "conv2/bias": (24,),
-          "conv3/kernel": (2, 12, 8), "conv3/bias": (8,)}
-
-@network("paper", shapes=SHAPES)
-class Paper:
-    """The gated dilated CNN over a window of eight observations, all of it anew at every tick."""
-
-    @staticmethod
-    def start(p, x):
-        return jnp.stack([x] * 7)
-
-    @staticmethod
-    def step(p, past, x):
-        window = h = jnp.concatenate([past, x[None]])
-        for i, dilation in ((1, 1), (2, 2), (3, 4)):
-            older, newer = p[f"conv{i}/kernel"]
-            z = h[:-dilation] @ older + h[dilation:] @ newer + p[f"conv{i}/bias"][None]
-            n = z.shape[1] // 2
-            h = jnp.tanh(z) if i == 3 else jnp.tanh(z[:, :n]) * sigmoid(z[:, n:])
-        return h[0], window[1:]
-'''
 
 
 def played(config: TaskConfig, policy: Policy) -> make.PlayedEpisodes:
@@ -107,33 +75,6 @@ def test_a_term_that_is_no_number_is_masked_and_counted(policy):
     plain = played(TaskConfig(sim_rate=75.0), policy)
     np.testing.assert_array_equal(found.finite, plain.outcome != "missed")
     assert np.isnan(found.returns[~found.finite]).all()
-
-
-@pytest.mark.slow
-def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
-    mine = user_defined.load(NETWORKS, "networks.py").networks["paper"]
-    assert mine.size == contract.n_parameters()
-    config = TaskConfig(sim_rate=75.0, max_steps=60)
-    found, wanted = played(config, replace(policy, network=mine)), played(config, policy)
-    assert len(set(wanted.outcome)) > 1 or np.ptp(wanted.terms["state_transition"]) > 0.1
-    same = np.isclose(found.returns, wanted.returns, rtol=1e-3, atol=1e-3)
-    assert same.mean() > 0.98  # a contact turns rounding into another bounce
-    np.testing.assert_allclose(found.peak_velocity[same], wanted.peak_velocity[same], rtol=1e-3, atol=1e-3)
-
-
-def test_the_pages_built_in_term_is_one_function_and_one_weight():
-    """The diff of docs/how-to/define-a-task.md."""
-    page = (ROOT / "docs" / "how-to" / "define-a-task.md").read_text(encoding="utf-8")
-    code, weights = re.search(r"```diff\n(.*?)--- mjx_tt/env/reward_weights.py\n(.*?)```", page, re.S).groups()
-    names = dict(vars(task))
-    exec("\n".join(line[1:] for line in code.splitlines() if line.startswith("+")), names)
-    term, command = names["wrist"], np.array([0.0] * 7 + [-2.5])
-    assert float(term(SimpleNamespace(command=command, limits=contract.LIMITS))) == pytest.approx(2.5 / np.deg2rad(600))
-    assert term.reduce == "one_minus_mean" and f'+    "{term.name}": ' in weights
-
-
-def test_the_same_text_gives_the_same_objects():
-    assert user_defined.load(MINE, "terms.py") is user_defined.load(MINE, "a run's configuration")
 
 
 GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, reward_term\n"
@@ -189,9 +130,3 @@ GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, r
 def test_a_mistake_in_the_file_is_named(text, says):
     with pytest.raises(ValueError, match=f"(?s)my.py.*{says}"):
         user_defined.load(text, "my.py").checked_network("n", 11)
-
-
-def test_theta_of_another_network_is_refused():
-    mine = user_defined.load(NETWORKS, "networks.py").networks["paper"]
-    with pytest.raises(ValueError, match="theta has 5 parameters, expected 976"):
-        mine.unflatten(np.zeros(5))

@@ -11,11 +11,10 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env.episode import MISSED, RETURNED, FixedAction, reshape_episodes
+from mjx_tt.env.episode import MISSED, RETURNED, reshape_episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import CONTRACT_OBSERVATIONS, Task, TaskConfig, weigh_rewards
-from mjx_tt.env.terms import ObservationTerm
+from mjx_tt.env.task import TaskConfig, weigh_rewards
 from mjx_tt.gradient import motion as motions
 from mjx_tt.gradient.incoming import fly_incoming
 from mjx_tt.gradient.network import differentiable
@@ -80,51 +79,6 @@ def test_it_hits_and_returns_the_balls_that_the_simulator_does(policy, pool, mod
     counted, faults = -terms.sum(0)[alike], np.asarray(played.faults).reshape(R, P)[alike]
     assert counted[misses[alike]].sum() > 20
     assert np.abs(faults - counted).sum() <= 0.01 * counted.sum() + 1.0  # a gap of nothing may round to either side
-
-
-def test_its_observations_are_those_of_the_simulator(policy, pool):
-    drawn = episodes(pool)
-    simulator = Simulator(CONFIG)
-    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshape_episodes(drawn, -1))
-    wanted = jax.jit(simulator.rollout)(policy, drawn)
-    hit = np.asarray(wanted.outcome) != MISSED
-    ends = np.asarray(played.ends).reshape(R, P)
-    column = int(np.argmax(hit.sum(0)))
-    assert hit[:, column].sum() > 10
-    # Of one policy alone whose balls are all hit: the sums over what it saw until then.
-    seen = np.asarray(played.observations).reshape(TICKS, -1, R, P)[..., column]
-    rows = [seen[: ends[i, column], :, i] for i in range(R) if hit[i, column]]
-    alone = replace_columns(drawn, hit[:, column], column)
-    one = Policy(policy.theta[:, column : column + 1], policy.mean, policy.inv_std)
-    sums = jax.jit(simulator.rollout)(one, alone).observation_sums[0, :, 0]
-    np.testing.assert_allclose(
-        sum((row - np.asarray(policy.mean)).sum(0) for row in rows), np.asarray(sums), atol=0.02, rtol=1e-4
-    )
-
-
-def test_further_observation_terms_are_those_of_the_simulator(pool):
-    """The command of the step before, while the robot moves under a constant action."""
-    term = ObservationTerm("last_command", lambda sensed: sensed.command, 0.5)
-    config = replace(CONFIG, sim_rate=75.0, observations=(*CONTRACT_OBSERVATIONS, term))
-    task, drawn = (
-        Task(config),
-        jax.tree.map(lambda x: x[..., :2] if x.ndim else x, reshape_episodes(episodes(pool), -1)),
-    )
-    controller = FixedAction(jnp.full((8, 2), 0.3), jnp.zeros(19))
-
-    def move(drawn):
-        constants = task.prepare(drawn)
-        ball = fly_incoming(task, drawn, constants, 4)
-        return motions.simulate_motion(task, motions.Servos(task), controller, drawn, constants, ball)
-
-    moved = jax.jit(move)(drawn)
-    assert moved.observations.shape == (4, 19, 2) and np.abs(moved.commands[0]).min() > 0.01
-    np.testing.assert_array_equal(moved.observations[0, 11:], 0.0)
-    np.testing.assert_allclose(moved.observations[1:, 11:], 0.5 * moved.commands[:-1], rtol=1e-6)
-
-
-def replace_columns(drawn, rows, column):
-    return jax.tree.map(lambda x: x[..., rows, column : column + 1] if x.ndim >= 2 else x, drawn)
 
 
 class Loops:

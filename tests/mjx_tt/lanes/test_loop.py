@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_tt.lanes.emitter import Unsupported
 from mjx_tt.lanes.loop import _by_lanes, while_any
 
 COUNTS = (1, 15, 16, 17, 100)
@@ -37,24 +34,6 @@ def test_a_leapfrog_has_its_own_closed_form(lanes):
     w, (_, x, _) = oscillate(lanes, 200)
     theta = np.arccos(1.0 - 0.5 * (w.astype(float) * 0.01) ** 2)
     np.testing.assert_allclose(x, np.cos(200 * theta), atol=2e-5)
-
-
-def test_a_lane_has_the_column_of_its_number():
-    w, (_, x, _) = oscillate(60, 50, columns=20)
-    _, (_, alone, _) = oscillate(20, 50)
-    np.testing.assert_array_equal(np.reshape(x, (3, 20)), np.tile(alone, (3, 1)))
-
-
-def test_a_state_may_keep_repeats_and_columns_apart():
-    def step(tick, s, by_lane, by_column):
-        live, x, apart = s
-        return live, x + 1.0, 2.0 * apart + x.reshape(1, -1, by_column.shape[-1]) * by_column
-
-    start = (jnp.ones(60, bool), jnp.arange(60.0), jnp.zeros((1, 3, 20)))
-    columns = jnp.arange(20.0)[None]
-    both = [while_any(lambda s: s[0], step, start, (), columns, limit=3, lanes=lanes) for lanes in (True, False)]
-    assert both[0][2].shape == (1, 3, 20)
-    np.testing.assert_array_equal(both[0][2], both[1][2])
 
 
 def countdown(lanes: bool):
@@ -117,34 +96,3 @@ def test_a_loop_within_a_loop_and_a_map():
         for i in range(3):
             wanted = wanted * 0.5 + i
     np.testing.assert_allclose(jax.jit(lambda x: jax.lax.map(block, x))(x), wanted, rtol=1e-6)
-
-
-def test_an_argument_that_is_no_array_is_left_to_xla():
-    class Doubler:
-        def __call__(self, x):
-            return 2.0 * x
-
-    start = (jnp.ones(3, bool), jnp.ones(3))
-    done = while_any(lambda s: s[0], lambda t, s, lanes, twice: (s[0], twice(s[1])), start, (), Doubler(), limit=3)
-    np.testing.assert_array_equal(done[1], [8.0] * 3)
-
-
-@pytest.mark.parametrize(
-    "state, columns, said",
-    [
-        ((jnp.ones(3, bool), jnp.ones(())), (), "a scalar in the state"),
-        ((jnp.ones(3, bool), jnp.ones(4)), (), "last axes of"),
-        ((jnp.ones(3, bool), jnp.ones(3)), (jnp.ones((2, 3)), jnp.ones((2, 4))), "last axes of"),
-        ((jnp.ones(0, bool), jnp.ones(0)), (), "no lanes"),
-    ],
-)
-def test_a_form_that_does_not_fit_is_named(state, columns, said):
-    with pytest.raises(Unsupported, match=said):
-        _by_lanes(lambda s: s[0], lambda t, s, lanes, columns: s, state, (), columns, 1)
-
-
-def test_a_loop_that_is_known_is_not_left_to_xla(caplog):
-    caplog.set_level(logging.INFO)
-    done = while_any(lambda s: s[0], lambda t, s, a, b: (s[0], s[1] + 1.0), (jnp.ones(3, bool), jnp.zeros(3)), limit=4)
-    np.testing.assert_array_equal(done[1], [4.0] * 3)
-    assert "left to XLA" not in caplog.text

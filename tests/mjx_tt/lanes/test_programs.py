@@ -9,7 +9,7 @@ import pytest
 import scipy.special
 
 from mjx_tt.lanes.emitter import Unsupported
-from mjx_tt.lanes.loop import _by_lanes, while_any
+from mjx_tt.lanes.loop import _by_lanes
 
 L = 37  # two vectors and a part of one
 ODD = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, 3.4e38, -3.4e38, 1.2e-38, np.inf, -np.inf, np.nan]
@@ -205,23 +205,3 @@ def test_sums_and_products_agree_to_rounding(function):
 def test_what_is_not_known_is_named(function, said):
     with pytest.raises(Unsupported, match=said):
         by_lanes(function, M)
-
-
-def test_what_is_not_known_is_left_to_xla(caplog):
-    state = (jnp.ones(L, bool), jnp.asarray(M))
-    caplog.set_level("INFO")
-    done = while_any(lambda s: s[0], lambda t, s, lanes, columns: (s[0], jnp.sort(s[1], axis=0)), state, limit=3)
-    np.testing.assert_array_equal(done[1], np.sort(M, axis=0))
-    assert "a loop is left to XLA: the operation sort" in caplog.text
-
-
-@pytest.mark.parametrize("x, said", [(2.0, "not among its arguments"), (np.ones(L, np.float32), "tracing with")])
-def test_an_array_that_the_step_closes_over_is_no_constant(x, said):
-    def run(x):
-        def step(tick, s, lanes, columns):
-            return s[0], s[1] + x
-
-        return _by_lanes(lambda s: s[0], step, (jnp.ones(L, bool), jnp.ones(L)), (), (), 1)
-
-    with pytest.raises(Unsupported, match=said):
-        jax.jit(run)(jnp.asarray(x))

@@ -87,13 +87,6 @@ def test_predict_is_the_same_for_one_track_and_says_when_it_cannot():
         predict(tracks[0], horizon=(0.2, 0.1))
 
 
-def test_a_model_says_how_its_balls_spin():
-    lifted = with_values(SimModel(), LIFT | {"ball_spin.mean_x": 60.0, "ball_spin.std_x": 40.0})
-    assert Belief.of(SimModel()).spins is None
-    spins = Belief.of(lifted).spins
-    np.testing.assert_allclose([spins.mean, spins.std], [[60.0, 0.0, 0.0], [40.0, 0.0, 0.0]])
-
-
 @pytest.mark.slow
 def test_spins_are_learnt_from_the_flights():
     tracks, _, spins = spinning()

@@ -9,14 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballmodel.contact import TABLE
 from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import (
     BISECTIONS,
     CapsuleClearance,
-    segment_box_distance,
-    segment_distance,
 )
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
@@ -144,42 +141,3 @@ def test_every_pair_that_can_touch_is_watched(distances):
 def test_what_is_not_watched_against_the_table_never_reaches_it(distances):
     for name in ("col_beam", "col_base"):
         assert distances[frozenset((name, "col_table"))].min() > 0.03
-
-
-def test_segment_distance_by_hand():
-    def segments(*points):
-        return [np.array(p, float)[:, None] for p in points]
-
-    with jax.enable_x64(True):
-        for points, wanted in (
-            (([0, 0, 0], [1, 0, 0], [0.5, -1, 2], [0.5, 1, 2]), 2.0),  # crossing above
-            (([0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]), 1.0),  # parallel, side by side
-            (([0, 0, 0], [1, 0, 0], [3, 0, 0], [2, 0, 0]), 1.0),  # on one line
-            (([0, 0, 0], [1, 0, 0], [2, 1, 0], [4, 3, 0]), np.sqrt(2)),  # end to end
-            (([0, 0, 0], [1, 0, 0], [0.5, 3, 0], [0.5, 1, 0]), 1.0),  # end to middle
-            (([0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 1, 0]), 0.0),  # crossing
-            (([0, 0, 0], [0, 0, 0], [3, 4, 0], [3, 4, 0]), 5.0),  # points
-        ):
-            assert float(segment_distance(*segments(*points))[0]) == pytest.approx(wanted, abs=1e-9)
-
-
-def test_segment_box_distance_by_hand():
-    x, y, z = TABLE.half
-    with jax.enable_x64(True):
-        for p, q, wanted in (
-            ([0, 0, 0.3], [0.2, -0.5, 0.1], 0.1),  # over the top, end nearest
-            ([x + 0.3, -1, -z], [x + 0.3, 1, -z], 0.3),  # along the side
-            ([-0.2, y + 0.05, 0.4], [0.3, y + 0.05, 0.4], np.hypot(0.05, 0.4)),  # over the edge, middle nearest
-            ([x + 0.03, y + 0.04, -0.2], [x + 0.03, y + 0.04, 0.1], 0.05),  # past the corner, at its height
-            ([0, 0, 0.1], [0.1, 0, -0.1], 0.0),  # through
-            ([0, 0, 0.5], [0, 0, 0.5], 0.5),  # a point
-        ):
-            found = segment_box_distance(TABLE, *(np.array(e, float)[:, None] for e in (p, q)))
-            assert float(found[0]) == pytest.approx(wanted, abs=1e-4)
-
-
-def test_a_model_without_its_capsules_is_refused(model):
-    kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
-    some = [c for c in mjcf.capsules(model) if c.name != "col_wrist"]
-    with pytest.raises(ValueError, match=r"lacks the capsules \['col_wrist'\]; it has .*'col_base'"):
-        CapsuleClearance(kinematics, some, WATCHED)

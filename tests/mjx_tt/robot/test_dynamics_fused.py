@@ -72,20 +72,6 @@ def test_fused_in_float32_stays_within_its_rounding():
         np.testing.assert_allclose(mine, theirs, atol=2e-5)
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
-def test_any_batch_shape_gives_the_same_numbers(batch):
-    model = a_pendulum()
-    engine = FusedEngine(chain_from_model(model))
-    rng = np.random.default_rng(2)
-    with jax.enable_x64(True):
-        qpos, qvel, ctrl = (rng.uniform(-1, 1, (n, *batch)) for n in (model.nq, model.nv, model.nu))
-        after = jax.jit(engine.step)(qpos, qvel, ctrl)
-        flat = step_in_c(model, *(x.reshape(len(x), -1) for x in (qpos, qvel, ctrl)))
-    for mine, theirs in zip(after, flat, strict=True):
-        assert mine.shape == (model.nq, *batch)
-        np.testing.assert_allclose(mine.reshape(model.nq, -1), theirs, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.optimised
 @pytest.mark.slow
 def test_whole_episodes_agree_with_mjx_in_float32():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_tt.robot import mjcf, robots
-from mjx_tt.robot.chain import body_frames, chain_from_model, site_frame
+from mjx_tt.robot.chain import chain_from_model, site_frame
 from mjx_tt.robot.kinematics import PaddleKinematics
 from tests.oracles.chains import CART, CRANE, SKEW
 
@@ -51,24 +51,3 @@ def test_pose_and_velocity_of_a_site_match_mujoco(model, site, x64, atol):
             found = getattr(pose, name)
             assert found.dtype == q.dtype
             np.testing.assert_allclose(found[:, i], wanted, atol=atol * max(1.0, np.abs(wanted).max()), err_msg=name)
-
-
-@pytest.mark.parametrize(("model", "site"), MODELS)
-def test_points_on_links_match_mujoco(model, site):
-    """Every body's frame, through the link that carries it, including bodies that do not move."""
-    chain, frames = chain_from_model(model), body_frames(model)
-    q, qd = random_states(model, 5, 1)
-    point = np.array([0.1, -0.2, 0.3])
-    with jax.enable_x64(True):
-        kinematics = PaddleKinematics(chain, site_frame(model, site))
-        links = kinematics.links(q)
-        found = [[np.broadcast_to(x, q.shape[1:]) for x in kinematics.point(links, f, point)] for f in frames]
-    data = mujoco.MjData(model)
-    for i in range(q.shape[1]):
-        data.qpos[:] = q[:, i]
-        mujoco.mj_kinematics(model, data)
-        for body in range(model.nbody):
-            if model.body_mocapid[body] >= 0:
-                continue
-            wanted = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
-            np.testing.assert_allclose([x[i] for x in found[body]], wanted, atol=1e-12)

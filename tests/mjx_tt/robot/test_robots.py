@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import jax
@@ -105,16 +104,3 @@ def test_a_contract_survives_its_description(name):
     assert sum(part.size for part in contract.unflatten(theta, shapes).values()) == theta.size
     with pytest.raises(ValueError, match=f"theta has {theta.size} parameters, expected 976"):
         contract.unflatten(theta)
-
-
-def test_robots_are_equal_by_their_content_and_hashable():
-    assert robots.load("fr3_pedestal") == robots.load_shipped("fr3_pedestal")
-    assert hash(robots.load("fr3_pedestal")) == hash(robots.load_shipped("fr3_pedestal"))
-    lifted = robots.load("fr3_pedestal").mounted((0.0, -2.0, 0.0), 0.0, robots.load("fr3_pedestal").file.home)
-    assert lifted != robots.load("fr3_pedestal") and lifted.contract != robots.load("fr3_pedestal").contract
-
-
-def test_a_robot_that_only_shares_the_papers_name_is_another():
-    paper = robots.paper()
-    moved = dataclasses.replace(paper, file=dataclasses.replace(paper.file, position=(0.0, 0.1, 0.0)))
-    assert moved.contract != PAPER and moved.contract.geometry is not None

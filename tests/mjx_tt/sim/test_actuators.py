@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +11,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ballmodel.partial_params import without_nominal
 from mjx_tt.robot import mjcf
 from mjx_tt.sim import actuators, model
-from mjx_tt.sim.actuators import DriveParams, Drives, JointDrive
-from mjx_tt.sim.model import Range, SimModel
-from robot_io.contract import JOINT_NAMES, LIMITS, N_JOINTS
+from mjx_tt.sim.actuators import Drives, JointDrive
+from robot_io.contract import JOINT_NAMES, N_JOINTS
 from tests.support import scripted_episodes
 from tests.support.scripted_episodes import episodes, script, task
 
@@ -226,22 +223,3 @@ def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end(
             carried.append(float(output))
     np.testing.assert_allclose(carried, play_in(0.1, path), atol=1e-12)
     assert max(carried) == pytest.approx(0.3 - 0.05, abs=1e-4)  # the amplitude loses half the play
-
-
-def test_drives_are_those_of_the_contracts_joints_and_nominal_ones_cost_nothing():
-    assert tuple(DriveParams.__dataclass_fields__) == JOINT_NAMES
-    assert actuators.NO_VELOCITY_LIMIT > 2 * max(LIMITS.velocity)
-    nominal = actuators.sort_by_effect(without_nominal(DriveParams()), (3,), jnp.float32)
-    assert jax.tree.leaves(nominal) == [] and not nominal.follows
-    one = replace(DriveParams(), joint_3=JointDrive(lag=0.02))
-    only = actuators.sort_by_effect(without_nominal(one), (3,), jnp.float32)
-    assert len(jax.tree.leaves(only)) == 1
-    wanted = np.where(np.array(JOINT_NAMES) == "joint_3", 0.02, 0.0)
-    np.testing.assert_allclose(only.lag, np.repeat(wanted[:, None], 3, axis=1), rtol=1e-6)
-
-
-def test_a_range_of_a_drive_gives_the_model_drives():
-    drawn = model.draw(jax.random.key(0), SimModel(), (Range("drives.joint_2.lag", 0.01, 0.03),), (200,))
-    lag = np.asarray(drawn.drives.joint_2.lag)
-    assert lag.shape == (200,) and 0.01 <= lag.min() < 0.013 and 0.027 < lag.max() <= 0.03
-    assert drawn.drives.joint_1 == JointDrive()

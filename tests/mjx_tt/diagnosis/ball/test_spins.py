@@ -11,8 +11,7 @@ from sklearn.mixture import GaussianMixture
 
 from mjx_tt import SimModel
 from mjx_tt.diagnosis import diagnose, load_logs
-from mjx_tt.diagnosis.ball.flights import spin_prior
-from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, learned
 from tests.exam.generator.sessions import draw_balls, measure, with_spin
 from tests.exam.generator.world import World
 from tests.exam.generator.write import ball_csv
@@ -53,57 +52,10 @@ def test_a_distribution_is_learned_through_flights_that_show_little():
     np.testing.assert_allclose(found.std, std, rtol=0.2)
 
 
-def test_one_kind_of_spin_is_called_one():
-    rng = np.random.default_rng(2)
-    spin = rng.normal([40, 0, 0], [30, 20, 25], (300, 3))
-    assert learned(np.repeat(0.04 * np.eye(3)[None], 300, axis=0), 0.04 * spin).components == 1
-
-
-def test_the_prior_moves_with_its_mean():
-    prior = SpinPrior(np.ones(3), np.ones(3), np.zeros((3, 5)), np.repeat(np.eye(3)[None], 5, axis=0))
-    moved = prior.moved(np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(moved.mean, [2.0, 3.0, 4.0])
-    np.testing.assert_array_equal(moved.of_balls(5)[0][:, 4], [1.0, 2.0, 3.0])
-    assert moved.of_some(np.array([0, 2])).own_mean.shape == (3, 2)
-    assert spin_prior.MAGNUS_RANGE[0] > 0.0
-
-
 def _log(tmp_path, world, balls, rng):
     path = tmp_path / "ball.csv"
     path.write_text(ball_csv(measure(world, balls, "iid", rng)))
     return load_logs([path])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), (0.80, 0.11)])
-def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restitution, friction):
-    """The straight line from the nominal model leads to a spin that is not there."""
-    rng = np.random.default_rng(4)
-    found = diagnose(_log(tmp_path, World(restitution=restitution, friction=friction), draw_balls(rng, 60), rng))
-    causes = {c.name: c for c in found.verdict.causes}
-    assert found.verdict.verdict == "named" and set(causes) == {"table_restitution", "table_friction"}
-    for name, path, true in (
-        ("table_restitution", "ball.table.restitution", restitution),
-        ("table_friction", "ball.table.friction", friction),
-    ):
-        estimate = causes[name].parameters[path]
-        assert abs(estimate.estimate - true) < 0.003 and estimate.high - estimate.low < 0.01
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.93, 0.89])
-def test_bounces_that_differ_from_ball_to_ball_are_no_cause_and_hide_none(tmp_path, restitution):
-    """The table's restitution and friction are drawn anew for every ball, which is not what the fit assumes of them."""
-    rng = np.random.default_rng(8)
-    balls, n = draw_balls(rng, 120), 120
-    world = World(restitution=restitution + rng.normal(0.0, 0.02, n), friction=0.25 * (1 + rng.normal(0.0, 0.15, n)))
-    found = diagnose(_log(tmp_path, world, balls, rng))
-    causes = {c.name: c for c in found.verdict.causes}
-    assert set(causes) == ({"table_restitution"} if restitution < 0.93 else set())
-    assert found.verdict.verdict == ("named" if causes else "none")
-    assert not found.verdict.unexplained
-    # The vertical kick, as the table gave it: restitution's spread times the speed of the impact.
-    assert found.balls.search.noise.scatter[2] == pytest.approx(0.02 * 3.0, rel=0.4)
 
 
 def _model(magnus_coefficient):

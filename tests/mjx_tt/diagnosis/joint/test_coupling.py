@@ -85,8 +85,3 @@ def test_a_robot_that_moves_on_through_a_pause_is_not_set_anew():
     assert cut[0].resumed().size == 1
     np.testing.assert_allclose(predicted(cut), whole[keep], atol=1e-9)
     assert np.abs(whole - whole[0] - (true[0] - true[0][0])).max() < 2e-4
-
-
-def test_joints_that_are_not_all_logged_have_no_coupling():
-    records, _ = plays(1)
-    assert coupling(records[:7], {r.joint: nominal_response(SimModel(), r.joint) for r in records}) == {}

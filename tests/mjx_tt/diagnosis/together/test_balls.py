@@ -9,7 +9,7 @@ from ballmodel.trajectory import Trajectory
 from experiments.config.study import PRIOR
 from mjx_tt.diagnosis.ball import posterior
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, own_spins
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, Situation
+from mjx_tt.diagnosis.ball.flights.linearization import Situation
 from mjx_tt.diagnosis.ball.search import SCATTER
 from mjx_tt.diagnosis.together import balls as of_balls
 from mjx_tt.sim.model import SimModel
@@ -30,36 +30,6 @@ def thrown(spin: np.ndarray, world: World | None = None, samples: int = 56) -> l
     seen = path.at(np.repeat(time[:, None], n, axis=1)) + rng.normal(0.0, 0.003, (3, time.size, n))
     flown = np.isfinite(seen).all(axis=0)  # until a ball has left the room
     return [Trajectory("day", str(i), time[flown[:, i]], seen[:, flown[:, i], i]) for i in range(n)]
-
-
-def apart(one: of_balls.BallsTogether, other: of_balls.BallsTogether) -> float:
-    """Largest difference of two posteriors' middles, in standard deviations as they are stated.
-
-    Two fits of the same balls by different ways may each end so far from the maximum that nothing moves them any more.
-    """
-    lift = [effect.path for effect in one.problem.effects].index(of_balls.LIFT)
-    errors = posterior.stated(one.posterior.covariance, (lift, of_balls.LIFT_ERROR))
-    return float(np.max(np.abs(one.posterior.theta - other.posterior.theta) / errors))
-
-
-def test_balls_that_spin_faster_than_anybody_hits_are_left_out(monkeypatch):
-    """With a limit that some of these balls exceed: what is left is below it, and all else is as without the others."""
-    balls, said = thrown(np.random.default_rng(1).normal(0.0, 8.0, 80)), []
-    whole = of_balls.fit(balls, SimModel(), KNOWN)
-    # A spin that does not decay at all is as possible as one that decays by twice the prior's middle.
-    (decay,) = (effect for effect in whole.problem.effects if effect.name == "spin_decay")
-    assert decay.low == pytest.approx(-KNOWN[decay.path][0])
-    fast = np.linalg.norm(whole.posterior.at.start[SPIN], axis=0)
-    limit = float(np.sort(fast)[-4:-2].mean())  # two exceed it, if the others keep their spins
-    monkeypatch.setattr(of_balls, "FASTEST", limit)
-    found = of_balls.fit(balls, SimModel(), KNOWN, said.append)
-    left_out = [text for text in said if text.startswith("left out, for no ball flies like that")]
-    assert left_out[0].endswith(": 3") or left_out[0].endswith(": 2")
-    assert np.linalg.norm(found.posterior.at.start[SPIN], axis=0).max() <= limit
-    if len(left_out) == 1:
-        slower = [ball for ball, spin in zip(balls, fast, strict=True) if spin <= limit]
-        alone = of_balls.fit(slower, SimModel(), KNOWN)
-        assert apart(found, alone) < 2.0 * posterior.NEARLY_SETTLED
 
 
 def test_a_bounce_at_the_edge_decides_nothing():
@@ -112,18 +82,6 @@ def test_lift_of_lobs_that_hardly_spin_is_not_taken_for_larger(lift):
     assert found.posterior.std[at] < 0.05
     assert abs(float(values[of_balls.LIFT]) - lift) < 1.5 * of_balls.LIFT_ERROR
     assert abs(float(values["ball.table.restitution"]) - 0.92) < 0.003
-
-
-def test_a_ball_that_flies_unlike_the_others_is_left_out():
-    """One of 60 swings by 2 cm from side to side, as no effect and no spin does it."""
-    balls, said = thrown(np.zeros(60)), []
-    time = balls[3].time
-    swings = balls[3].position + np.array([[0.02], [0.0], [0.0]]) * np.sin(40.0 * time)
-    odd = [*balls[:3], Trajectory("day", "odd", time, swings), *balls[4:]]
-    found = of_balls.fit(odd, SimModel(), KNOWN, said.append)
-    assert "left out, for no ball flies like that: 1" in said
-    without = of_balls.fit([*balls[:3], *balls[4:]], SimModel(), KNOWN)
-    assert apart(found, without) < 2.0 * posterior.SETTLED
 
 
 def test_a_fit_that_did_not_settle_says_as_much_and_states_how_far_it_would_go_on(monkeypatch):

@@ -82,20 +82,6 @@ def test_axes_that_are_measured_later_than_the_arm_are_not_taken_for_zeros():
     assert abs(at["latency.ball_observation"] - 0.040) < 2.5 * error["latency.ball_observation"]
 
 
-@pytest.mark.slow
-def test_a_camera_that_sees_high_moves_the_ball_against_the_paddle():
-    """Bounces that lie 12 mm too high are the camera's: seen without it, the same hits show the same."""
-    measured, path = fitted(TRUTH, 7)
-    flights = balls.fit(measured, MODEL, {**FLIGHTS, hits.HEIGHT: (-3.0, 0.01)})
-    (height,) = (i for i, effect in enumerate(flights.problem.effects) if effect.path == hits.HEIGHT)
-    theta = flights.posterior.theta + 0.012 * np.eye(len(flights.problem.effects))[height]
-    above = replace(flights, posterior=replace(flights.posterior, theta=theta))
-    seen_high = [replace(t, position=t.position + np.array([[0.0], [0.0], [0.012]])) for t in measured]
-    plain, high = hits.fit(flights, measured, path, PRIOR), hits.fit(above, seen_high, path, PRIOR)
-    errors = np.sqrt(np.diagonal(plain.covariance))
-    assert np.all(np.abs(high.mean - plain.mean)[:-1] < 0.1 * errors[:-1]), (plain.mean, high.mean)
-
-
 def test_a_hit_that_is_met_or_missed_within_a_difference_decides_nothing():
     columns = np.random.default_rng(0).normal(size=(3, 6, 40))
     columns[1, 4, 17] = 60.0
@@ -103,18 +89,3 @@ def test_a_hit_that_is_met_or_missed_within_a_difference_decides_nothing():
     assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
     columns[2] = 0.0  # shows nowhere
     assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
-
-
-def test_too_few_hits_leave_everything_open():
-    measured, path = fitted(TRUTH, 7)
-    found = balls.fit(measured, MODEL, FLIGHTS)
-    assert hits.fit(found, measured[:8], path, PRIOR) is None
-    assert hits.fit(found, measured, None, PRIOR) is None
-
-
-def test_a_prior_without_anything_that_flies_is_refused():
-    measured, _ = play(TRUTH, 7)
-    with pytest.raises(
-        ValueError, match="nothing that flights show is in the prior, which has ball.paddle.restitution"
-    ):
-        balls.fit(measured, MODEL, {"ball.paddle.restitution": (0.9, 0.05)})

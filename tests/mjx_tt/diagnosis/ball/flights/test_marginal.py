@@ -118,18 +118,6 @@ def test_gradient_is_that_of_the_density(balls, theta):
         assert gradient[k] == pytest.approx((up - down) / 2e-4, abs=0.01 * np.sqrt(found.gram.sum(axis=0)[k, k]) + 0.5)
 
 
-def test_without_the_determinant_spins_would_seem_to_show_more(balls, information):
-    mean, spread, _ = balls.most_likely(TRUTH)
-    p, more = balls.products(TRUTH, mean, spread)
-    steps = []
-    for growth in (more, np.zeros_like(more)):
-        found = marginal.evidence(p, TRUTH, one_gaussian(mean, spread[:3]), spread[3:], growth)
-        total = found.gram.sum(axis=0)
-        steps.append(np.linalg.solve(total, found.right.sum(axis=0) - total @ TRUTH)[0])
-    error = np.sqrt(np.linalg.inv(information)[0, 0])
-    assert abs(steps[0]) < 3.0 * error < steps[1]
-
-
 @pytest.fixture(scope="module")
 def information(balls) -> np.ndarray:
     """(2, 2) by differences of the likelihood with mean and spread the most likely at each place."""
@@ -163,22 +151,6 @@ def test_spins_and_kicks_are_told_apart(balls):
     np.testing.assert_allclose(scatter, spread[3:], rtol=0.1)
     np.testing.assert_allclose(prior.std, spread[:3], rtol=0.1)
     np.testing.assert_allclose(prior.mean, mean, atol=0.15)
-
-
-def test_kicks_that_are_none_are_seen_at_once():
-    rng = np.random.default_rng(0)
-    information = np.broadcast_to(np.diag([2e3, 3e3, 4e3]), (400, 3, 3))
-    score = rng.normal(size=(400, 3)) * np.sqrt([2e3, 3e3, 4e3])
-    zero = np.zeros((400, 3, 3))
-    p = Products(
-        np.zeros((400, 1, 1)),
-        np.zeros((400, 1)),
-        np.block([[zero, zero], [zero, information]]),
-        np.zeros((400, 6, 1)),
-        np.concatenate([np.zeros((400, 3)), score], axis=1),
-    )
-    _, scatter = marginal.distributions(p, np.zeros(1), None, np.full(3, 0.1))
-    assert np.all(scatter < 0.008)  # one step of expectation-maximisation leaves half of what one flight shows: 0.016
 
 
 def test_growth_is_the_derivative_of_what_flights_say_about_spins():
