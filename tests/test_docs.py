@@ -37,7 +37,8 @@ KEY = re.compile(r"(?:^|[{,]) *-? *([a-z]\w+): ", re.MULTILINE)
 # Words of other programs and standards, and names that a reader fills in.
 FOREIGN = set(
     "Args EGMStreamStart EGM_STOP_RAMP_DOWN JobSet RESULTS Raises Returns SESSION TRobEGM "
-    "T_ROB1 a0 ars_algorithm etc human_M0 icp_map launch_param profidrive rerun security sha256sum ssh telegram111 ulimit".split()
+    "T_ROB1 a0 ars_algorithm etc human_M0 icp_map launch_param profidrive rerun security sha256sum ssh telegram111 "
+    "ulimit".split()
 )
 
 
