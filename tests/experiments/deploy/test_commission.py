@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 from dataclasses import replace
 
 import pytest
 import yaml
+from rich.console import Console
 
+from experiments.config import robot as robots
+from experiments.deploy import first_day
 from experiments.deploy.commission import Commissioning, NotProven, Record
+from mjx_tt.robot import robots as simulated
+from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.network import NetworkFaults
+from robot_io.emulator.processes import Rig
 from robot_io.emulator.tracker.hidden import HiddenErrors
 from tests.support.commissioning_rig import LockStepHands, LockStepSession, Person
+from tests.support.lockstep_play import throws
+from tests.support.paths import ROOT
 
 RIG = RigParams(pause=0.05)
+POLICY = ROOT / "experiments" / "shipped" / "policies" / "quickstart"
 
 
 def hidden(**errors):
@@ -106,3 +117,20 @@ def test_a_right_robot_is_proven_whole_and_resumed(tmp_path):
     assert not person.done and all("proven 20" in line for line in person.said)
     (tmp_path / "robot.yaml").write_text("name: other\n")
     assert not Record.of(tmp_path / "robot.yaml").proven
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.skipif("COMMISSION_RIG" not in os.environ, reason="minutes on two quiet cores: COMMISSION_RIG=1 runs it")
+@pytest.mark.parametrize("name", [None, "tracker x mirrored", "CommTimeout", "axis unit"])
+def test_over_real_sockets_in_real_time(tmp_path, name):
+    params, _, answers, step, named = MISTAKES[name] if name else (RIG, None, {}, "", "")
+    path, console = tmp_path / "robot.yaml", Console(record=True, width=300)
+    with Rig(str(simulated.paper().scene()), throws(), params) as rig:
+        path.write_text(robots.to_yaml(rig.robot))
+        person = Person(rig, **answers)
+        status = first_day.run(rig.robot, Record.of(path), person, tmp_path, console, POLICY, PAPER)
+    if name is None:
+        assert status == 0 and list(Record.of(path).proven) == list(Commissioning(*[None] * 2, rig.robot, None).steps)
+    else:
+        assert status == 1 and re.search(f"not proven: ({step}): .*{named}", console.export_text())
