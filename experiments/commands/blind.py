@@ -82,6 +82,7 @@ def _make(folder: Path, given: tuple[str, ...], trainer: str, evaluator: str, se
     codes = blind_protocol.make(folder, policies, trainer, evaluator, seed)
     where = f"{len(codes)} policies under {folder / blind_protocol.POLICIES}"
     console.print(f"{where}, to be tested in this order: {' '.join(codes)}", soft_wrap=True)
+    console.print(f"to print: {folder / blind_protocol.PAGE}", soft_wrap=True)
     console.print(
         f"sheet: {folder / blind_protocol.SHEET}; the key is sealed in {folder / blind_protocol.KEY}", soft_wrap=True
     )

@@ -19,6 +19,8 @@ import string
 import zlib
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, replace
+from html import escape
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 KEY, SHEET, POLICIES, OPENED, EVALUATIONS = "key.sealed", "sheet.csv", "policies", "key.json", "evaluations.csv"
 BEGUN = ".begun"  # while an evaluation is being made
+PAGE = "instructions.html"  # to print
 SHEET_COLUMNS = ("code", "rally", "length", "end")
 SEPARATORS = ",;\t"
 SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtered
@@ -145,6 +148,7 @@ def make(folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, 
         "seed": seed,
     }
     write_blank_sheet(folder / SHEET, tuple(key.values()))
+    write_page(folder / PAGE, tuple(key.values()))
     seal(folder / KEY, content)
     begun.unlink()
     return tuple(key.values())
@@ -178,12 +182,37 @@ def write_blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scorin
     end-of-rally attribution), then a line for every rally."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         file.writelines(f"# {line}\n" for line in INSTRUCTIONS)
-        who = {True: "the robot ended it", False: "the human ended it", None: "open"}
-        for number, (_, description, ended, filtered) in enumerate(ROWS, 1):
-            file.write(f"# {number:>2}  {description} [{'not counted' if filtered else who[ended]}]\n")
+        file.writelines(f"# {number:>2}  {description} [{who}]\n" for number, description, who in list_ends())
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(SHEET_COLUMNS)
         writer.writerows((code, rally, "", "") for code in tested for rally in range(1, rallies + 1))
+
+
+def list_ends() -> list[tuple[int, str, str]]:
+    """Number, description and meaning of each row of the table of ends."""
+    who = {True: "the robot ended it", False: "the human ended it", None: "open"}
+    return [
+        (number, description, "not counted" if filtered else who[ended])
+        for number, (_, description, ended, filtered) in enumerate(ROWS, 1)
+    ]
+
+
+def write_page(path: Path, tested: tuple[str, ...]) -> None:
+    """Instructions to player and evaluator, safety, consent and a sheet by hand for each code, as one page to print."""
+    told = resources.files("experiments.study.report").joinpath("templates/players.html").read_text(encoding="utf-8")
+    ends = "".join(f"<li value={n}>{escape(text)} [{who}]</li>" for n, text, who in list_ends())
+    lines = "<tr><td>&nbsp;<td><td></tr>" * (scoring.POOL + SPARE)
+    sheets = "".join(
+        f"<h2>{code}</h2><table border=1 width=100%><tr><th>rally<th>length<th>end</tr>{lines}</table>"
+        for code in tested
+    )
+    with replacing(path) as temporary:
+        temporary.write_text(
+            '<!doctype html><meta charset="utf-8"><title>Instructions</title>'
+            "<style>body{font:11pt sans-serif;max-width:18cm;margin:auto}table{page-break-after:always}</style>"
+            f"{told}<h2>Ends of rallies</h2><ol>{ends}</ol>{sheets}\n",
+            encoding="utf-8",
+        )
 
 
 def read_sheet(path: Path) -> dict[str, list[Played]]:

@@ -38,7 +38,7 @@ class Owner:
         pipe: Connection,
         bridge: Bridge,
         axes: AxesThread | DryAxes | FixedBase,
-        compile_policy: Callable[[Policy], StepPolicy] | None = None,
+        compile_policy: Callable[[Policy], StepPolicy],
     ) -> None:
         self.pipe, self.quits = pipe, False
         self._bridge, self._axes, self._compile = bridge, axes, compile_policy
@@ -87,7 +87,7 @@ class Owner:
                     self.tell(messages.Marked(*(Stay.of(history, now) for history in seen)))
                 case messages.Pause(on):
                     bridge.paused = on or bridge.config.jog
-                case messages.SetPolicy(policy, version) if self._compile is not None:
+                case messages.SetPolicy(policy, version):
                     bridge.check_exchange()  # before a policy is built, which takes its time
                     bridge.set_policy(self._compile(policy), version)
                     self.tell(messages.PolicySet(version))
@@ -121,14 +121,13 @@ class Owner:
         """Send a message with the next ``report`` or ``flush``."""
         self._unsent.append(message)
 
-    def flush(self) -> bool:
-        """Send what fits without waiting; True while something waits for an owner who is there."""
+    def flush(self) -> None:
+        """Send what fits without waiting."""
         try:
             while self._unsent and select.select([], [self.pipe], [], 0.0)[1]:
                 self.pipe.send(self._unsent.popleft())
         except (OSError, ValueError):
             self._unsent.clear()
-        return bool(self._unsent)
 
     def _played(self, summary: EpisodeSummary) -> None:
         self.tell(messages.Played(summary, self._bridge.play.track(summary.number)))

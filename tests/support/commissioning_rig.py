@@ -12,6 +12,7 @@ from robot_io.control.owner import Owner
 from robot_io.control.timings import Timings
 from robot_io.emulator.arm import ArmStateError
 from robot_io.emulator.config import RigParams
+from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.safety.config import SafetyConfig
 from tests.support.lockstep_play import lockstep
 
@@ -45,7 +46,7 @@ class LockStepSession:
         self.rig = lockstep(params=params, config=BridgeConfig(jog=True), safety=SafetyConfig(speed_scale=scale))
         self.status = None
         ours, self._theirs = multiprocessing.Pipe()
-        self._owner = Owner(ours, self.rig.bridge, _Thread(self.rig.axes))
+        self._owner = Owner(ours, self.rig.bridge, _Thread(self.rig.axes), StreamingPolicy)
 
     def send(self, request):
         self._owner.obey(request, self.rig.now)

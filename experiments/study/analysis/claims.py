@@ -12,6 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from experiments.runs import metrics
+from experiments.runs.run_dir import Run
 from experiments.stats import welch_interval
 from experiments.study.analysis.paper import BY_SKILL, CLAIMS, FINAL, TEN, Claim, of_level
 from experiments.study.analysis.scoring import Rallies
@@ -33,6 +35,9 @@ WIDEST = 4.0  # high over low end of a ratio's interval that still shows "no dif
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
 SHORT_RALLY = 5  # touches
+TUNED = {"is2r-sim1": "is2r-ft35", "is2r-sim2": "is2r-ft65", "is2r-sim3": "is2r-ft100", "oracle-sim": "oracle-ft"}
+"""Zero-shot policies, and what fine-tuning makes of them."""
+SMOOTH = 10  # updates over which a fine-tuning's return rate is averaged
 ONE_SEED = "the players of one seed alone, who share its reality"
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS = (
     "agrees",
@@ -49,6 +54,7 @@ UNITS = {
     "kept_ratio": RATIO,
     "model_change": RATIO,
     "model_change_by_level": RATIO,
+    "tuning_cost": RATIO,
     "normalised_difference": DIFFERENCE,
     "short_share_difference": DIFFERENCE,
     "longer_share": SHARE,
@@ -171,6 +177,27 @@ class Measurements:
     def model_change_by_level(self) -> Interval | None:
         """Second change of the human model, beginners over intermediate players."""
         return model_change_by_level(self.changes)
+
+    def tuning_cost(self) -> Interval | None:
+        """Updates of fine-tuning after a player's worst zero-shot policy over those after the best, to an equal level.
+
+        The level is the highest return rate, averaged over SMOOTH updates, that all of the player's fine-tunings reach.
+        """
+        logs = {}
+        for seed, player in ((s, p) for s in self.study.seeds for p in self.study.players):
+            found = []
+            for zero_shot, tuned in TUNED.items():
+                lengths = self.raw.cells.get((seed, player, player, zero_shot))
+                run = Run(self.study.paths.model(seed, player, tuned))
+                rates = [row["return_rate"] for row in metrics.read(run.metrics)]
+                if lengths is not None and len(rates) >= SMOOTH:
+                    found.append((lengths.mean(), np.convolve(rates, np.full(SMOOTH, 1.0 / SMOOTH), "valid")))
+            if len(found) > 1:
+                level = min(rates.max() for _, rates in found)
+                (_, worst), *_, (_, best) = sorted(found, key=lambda pair: pair[0])
+                taken = [int(np.argmax(rates >= level)) + SMOOTH for rates in (worst, best)]
+                logs[seed, player] = float(np.log(taken[0] / taken[1]))
+        return _geometric_mean(logs)
 
     def _difference(self, boot: Bootstrap, a: str, b: str, group: str, others: bool) -> Estimate | None:
         """Mean of a minus mean of b; ``larger`` is of the rally lengths."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import csv
+import html
 import json
 import zlib
 
@@ -15,6 +16,7 @@ from experiments import cli
 from experiments.errors import ConfigError
 from experiments.study import blind_protocol
 from experiments.study.analysis import scoring
+from mjx_tt.rally import end_reasons
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
 
@@ -136,6 +138,7 @@ def test_a_start_that_was_cut_off_begins_anew(tmp_path, artefacts, monkeypatch):
     assert (folder / "policies" / "A").exists() and not (folder / "key.sealed").exists()
     assert blind_protocol.make(folder, policies, "anna", "anna") == ("A", "B")
     assert sorted(path.name for path in folder.iterdir()) == [
+        "instructions.html",
         "key.sealed",
         "policies",
         "sheet.csv",
@@ -215,3 +218,21 @@ def test_a_rally_that_counts_has_a_touch(tmp_path):
     path.write_text("code,rally,length,end\nA,1,0,13\n")
     with pytest.raises(ConfigError, match="line 2: length 0: the human's first hit is 1"):
         blind_protocol.read_sheet(path)
+
+
+def test_the_page_to_print_has_instructions_ends_and_a_sheet_for_each_code(tmp_path):
+    path = tmp_path / blind_protocol.PAGE
+    blind_protocol.write_page(path, ("A", "B"))
+    text = path.read_text(encoding="utf-8")
+    for said in (
+        "right quadrant",
+        "the same one",
+        "played again",
+        "rest every twenty minutes",
+        "emergency stop",
+    ):
+        assert said in text
+    for _, description, *_ in end_reasons.ROWS:
+        assert html.escape(description) in text
+    assert text.count("<table") == 2 and text.index("<h2>A</h2>") < text.index("<h2>B</h2>")
+    assert text.count("<tr><td>") == 2 * 70  # 60 are pooled, ten may be filtered

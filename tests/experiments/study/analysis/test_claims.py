@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,3 +71,19 @@ def test_the_longest_rally_is_of_all_that_count(tmp_path):
     assert found.value == 151
     # One rally of a hundred is drawn again with probability 1 - 0.99^100.
     assert np.mean(found.draws == 151) == pytest.approx(1.0 - 0.99**100, abs=0.04)
+
+
+def test_a_poor_zero_shot_policy_costs_the_updates_to_an_equal_level(tmp_path):
+    """Two fine-tunings that rise alike, from 0.1 and from 0.4: to 0.645, the average that both reach."""
+    rallies = scoring.join([play("is2r-sim1", [2] * 60), play("oracle-sim", [8] * 60)])
+    m = Measurements(StudyFolder(tmp_path, {}, rallies))
+    for model, start in (("is2r-ft35", 0.1), ("oracle-ft", 0.4)):
+        folder = m.study.paths.model(0, "player3", model)
+        folder.mkdir(parents=True)
+        rows = ({"update": k + 1, "return_rate": start + 0.01 * k} for k in range(60))
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert m.tuning_cost() is None  # one player of one seed has no interval
+    shutil.copytree(tmp_path / "seed0", tmp_path / "seed1")
+    second = replace(rallies, seed=np.ones_like(rallies.seed))
+    m = Measurements(replace(m.study, rallies=scoring.join([rallies, second])))
+    assert m.tuning_cost().value == pytest.approx(60 / 30)
