@@ -32,9 +32,10 @@ from experiments.baselines.learners import (
     EvolutionLearner,
     Learner,
     PpoLearner,
+    SacLearner,
 )
 from experiments.config import build
-from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison
+from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Ppo
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, error_context
@@ -165,7 +166,8 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner:
         return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
     simulator = Simulator(experiment.task, 1)
-    return PpoLearner(settings, TableTennis(simulator, pool, model.model, model.randomise))
+    env = TableTennis(simulator, pool, model.model, model.randomise)
+    return PpoLearner(settings, env) if isinstance(settings, Ppo) else SacLearner(settings, env)
 
 
 class Trainings:

@@ -1,16 +1,19 @@
-"""Algorithms of a comparison on one task: evolution strategies of ``bgs``, and brax's own PPO training.
+"""Algorithms of a comparison on one task: evolution strategies of ``bgs``, and brax's own PPO and SAC training.
 
 A learner trains until its observer says that the budget is spent. The observer sees the policy and what the episodes
-brought after every piece of learning. A run cannot be resumed inside: brax's training function restores networks, but
-not the optimiser.
+brought after every piece of learning. A run cannot be resumed inside: brax's training functions restore networks, but
+neither the optimiser nor the replay buffer.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -21,11 +24,14 @@ from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import NestedMeanStd
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
+from brax.training.agents.sac import checkpoint as sac_checkpoint
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.agents.sac import train as sac
 from brax.training.types import Params
 
 from bgs import normalizer
 from experiments.config import build
-from experiments.config.baselines import Ppo
+from experiments.config.baselines import Ppo, Sac
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import flatten
 from mjx_tt.env.episode import Controller, Tick
@@ -33,6 +39,7 @@ from mjx_tt.env.policy import Policy, PolicyController
 from robot_io.contract import HISTORY
 
 ENDLESS = 2**40  # environment steps: the observer ends a training
+PIECE = 512  # control steps of each environment between two looks at a learner with a replay buffer
 COUNTED = ("episodes", "steps")
 
 Counts = dict[str, float]  # COUNTED, sums over a training so far
@@ -127,49 +134,25 @@ class EvolutionLearner:
         return PolicyController.of(Policy(state.bgs.average, *normalizer.normaliser(state.statistics)))
 
 
-class PpoLearner:
-    """``brax.training.agents.ppo.train``: a piece is one round of play and the learning from it."""
+class BraxLearner:
+    """What PPO and SAC share: networks, their deterministic policy, and the settings that brax names alike."""
 
-    def __init__(self, settings: Ppo, env: Env) -> None:
-        self._settings, self.env = settings, env
-        self._factory = partial(
-            ppo_networks.make_ppo_networks,
-            policy_hidden_layer_sizes=tuple(settings.policy_layers),
-            value_hidden_layer_sizes=tuple(settings.value_layers),
-        )
-        self._networks = self._factory(
+    def __init__(self, settings: Ppo | Sac, env: Env, factory: Any, make_inference_fn: Any) -> None:
+        self.env = env
+        self._networks = factory(
             env.observation_size, env.action_size, preprocess_observations_fn=running_statistics.normalize
         )
-
-    def train(self, seed: int, observe: Observer) -> None:
-        """As ``Learner``."""
-        settings, env = self._settings, EpisodeCounter(self.env)
-        with brax_on_new_jax(), suppress(BudgetSpent):
-            ppo.train(
-                env,
-                seed=seed,
-                num_timesteps=ENDLESS,
-                max_devices_per_host=1,
-                wrap_env=False,
-                episode_length=1,  # of wrappers that are not used
-                num_envs=settings.environments,
-                batch_size=settings.environments // settings.minibatches,
-                num_minibatches=settings.minibatches,
-                unroll_length=settings.unroll,
-                num_updates_per_batch=settings.epochs,
-                normalize_observations=True,
-                learning_rate=settings.learning_rate,
-                discounting=settings.discount,
-                reward_scaling=settings.reward_scale,
-                gae_lambda=settings.gae_lambda,
-                clipping_epsilon=settings.clip,
-                entropy_cost=settings.entropy_cost,
-                max_grad_norm=settings.max_gradient_norm,
-                network_factory=self._factory,
-                num_evals=-(-ENDLESS // (settings.environments * settings.unroll)) + 1,  # one after each round
-                run_evals=False,
-                policy_params_fn=lambda steps, make, params: observe(self._controller(*params[:2]), env.counts()),
-            )
+        self._make_policy = make_inference_fn(self._networks)
+        self._shared = {
+            "num_timesteps": ENDLESS,
+            "max_devices_per_host": 1,
+            "episode_length": 1,  # of evaluations and wrappers that are not used
+            "normalize_observations": True,
+            "learning_rate": settings.learning_rate,
+            "discounting": settings.discount,
+            "reward_scaling": settings.reward_scale,
+            "network_factory": factory,
+        }
 
     def template(self) -> NetworkController:
         """As ``Learner``."""
@@ -188,7 +171,100 @@ class PpoLearner:
         return NetworkController((scale, jax.tree.map(jnp.array, policy)), scale.mean[-newest:], self._decide)
 
     def _decide(self, parameters: Params, observation: jax.Array) -> jax.Array:
-        return ppo_networks.make_inference_fn(self._networks)(parameters, deterministic=True)(observation, None)[0]
+        return self._make_policy(parameters, deterministic=True)(observation, None)[0]
+
+
+class PpoLearner(BraxLearner):
+    """``brax.training.agents.ppo.train``: a piece is one round of play and the learning from it."""
+
+    def __init__(self, settings: Ppo, env: Env) -> None:
+        factory = partial(
+            ppo_networks.make_ppo_networks,
+            policy_hidden_layer_sizes=tuple(settings.policy_layers),
+            value_hidden_layer_sizes=tuple(settings.value_layers),
+        )
+        super().__init__(settings, env, factory, ppo_networks.make_inference_fn)
+        self._settings = settings
+
+    def train(self, seed: int, observe: Observer) -> None:
+        """As ``Learner``."""
+        settings, env = self._settings, EpisodeCounter(self.env)
+        with brax_on_new_jax(), suppress(BudgetSpent):
+            ppo.train(
+                env,
+                seed=seed,
+                **self._shared,
+                wrap_env=False,
+                num_envs=settings.environments,
+                batch_size=settings.environments // settings.minibatches,
+                num_minibatches=settings.minibatches,
+                unroll_length=settings.unroll,
+                num_updates_per_batch=settings.epochs,
+                gae_lambda=settings.gae_lambda,
+                clipping_epsilon=settings.clip,
+                entropy_cost=settings.entropy_cost,
+                max_grad_norm=settings.max_gradient_norm,
+                num_evals=-(-ENDLESS // (settings.environments * settings.unroll)) + 1,  # one after each round
+                run_evals=False,
+                policy_params_fn=lambda steps, make, params: observe(self._controller(*params[:2]), env.counts()),
+            )
+
+
+class SacLearner(BraxLearner):
+    """``brax.training.agents.sac.train``, which hands out policies in checkpoints only: the first after a piece."""
+
+    def __init__(self, settings: Sac, env: Env) -> None:
+        factory = partial(sac_networks.make_sac_networks, hidden_layer_sizes=tuple(settings.layers))
+        super().__init__(settings, env, factory, sac_networks.make_inference_fn)
+        self._settings = settings
+
+    def train(self, seed: int, observe: Observer) -> None:
+        """As ``Learner``."""
+        settings, env = self._settings, EpisodeCounter(self.env)
+        with brax_on_new_jax(), suppress(BudgetSpent), tempfile.TemporaryDirectory() as folder:
+
+            def look(steps: int, metrics: Any) -> None:
+                if steps:  # at 0 there is no checkpoint yet
+                    saved = Path(folder) / f"{steps:012d}"
+                    normaliser, policy = sac_checkpoint.load(saved)
+                    shutil.rmtree(saved)
+                    observe(self._controller(normaliser, policy), env.counts())
+
+            sac.train(
+                env,
+                seed=seed,
+                **self._shared,
+                wrap_env_fn=lambda env, **_: env,  # without wrap_env brax has no key
+                eval_env=NoEvaluation(self.env),
+                num_eval_envs=1,
+                num_envs=settings.environments,
+                min_replay_size=settings.random_steps,
+                max_replay_size=settings.capacity,
+                grad_updates_per_step=settings.gradient_steps,
+                batch_size=settings.batch,
+                tau=settings.target_rate,
+                num_evals=ENDLESS // (PIECE * settings.environments) + 1,
+                progress_fn=look,
+                checkpoint_logdir=folder,
+            )
+
+
+class NoEvaluation(Env):
+    """One step in an environment of that size: brax's SAC evaluates always, which is the comparison's business."""
+
+    def __init__(self, env: Env) -> None:
+        self._env = env
+
+    observation_size = property(lambda self: self._env.observation_size)
+    action_size = property(lambda self: self._env.action_size)
+    backend = property(lambda self: self._env.backend)
+
+    def reset(self, rng: jax.Array) -> State:
+        batch = jnp.zeros(rng.shape[:-1])
+        return State(None, jnp.zeros((*batch.shape, self.observation_size)), batch, batch, {}, {"steps": batch})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return state.replace(done=jnp.ones_like(state.done))
 
 
 @contextmanager

@@ -14,7 +14,7 @@ app = options.command(
     "compare",
     "compare learning algorithms on one task",
     """\
-  mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO: three minutes each
+  mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC: three minutes each
   mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
   mjx-tt compare mine.yaml --site cluster.yaml              each training on a cluster: docs/how-to/use-a-cluster.md
 

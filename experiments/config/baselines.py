@@ -89,7 +89,31 @@ class Ppo(Learning):
         return self
 
 
-Algorithm = Annotated[Bgs | Ppo, Field(discriminator="kind")]
+class Sac(Learning):
+    """Soft actor-critic by brax's training function; its first steps are of the untrained policy, not random."""
+
+    kind: Literal["sac"]
+    """This algorithm."""
+    environments: Count = 64
+    """Side by side."""
+    capacity: Count = 300_000
+    """Transitions kept; once so many are there, brax's buffer moves all of them at every step (0.1 us each)."""
+    random_steps: Count = 20_000
+    """Control steps, of all environments together, before learning begins."""
+    gradient_steps: Count = 1
+    """After every step of all environments."""
+    batch: Count = 256
+    """Transitions of a gradient step."""
+    layers: Layers = [128, 128]
+    """Hidden units of every network's layers."""
+    learning_rate: LearningRate = 1e-3
+    discount: Discount = 0.99
+    reward_scale: RewardScale = 10.0
+    target_rate: Share = 0.005
+    """By which the target network moves towards the critic in a gradient step."""
+
+
+Algorithm = Annotated[Bgs | Ppo | Sac, Field(discriminator="kind")]
 
 
 class Budget(Section):

@@ -14,10 +14,10 @@ from rich.console import Console
 
 from ballmodel import registry
 from experiments.baselines import compare
-from experiments.baselines.learners import BudgetSpent, PpoLearner
+from experiments.baselines.learners import BudgetSpent, PpoLearner, SacLearner
 from experiments.config import baselines
 from experiments.config import experiment as config
-from experiments.config.baselines import Ppo
+from experiments.config.baselines import Ppo, Sac
 from experiments.config.site import Site
 from experiments.errors import ConfigError, RunError
 from experiments.jobs.site import ALONE, Workers
@@ -54,13 +54,28 @@ def best(observation):
     return jnp.clip(observation @ WEIGHTS, -0.8, 0.8)
 
 
+SAC = Sac(
+    kind="sac", layers=[64, 64], environments=16, capacity=20_000, random_steps=2_000, gradient_steps=2, batch=128
+)
+
+
 @pytest.mark.optimised
 @pytest.mark.slow
-def test_ppo_comes_near_the_best_action():
-    learner = PpoLearner(
-        Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
-    )
-    pieces, steps = 120, 120 * 256 * 4
+@pytest.mark.parametrize(
+    "learner, pieces, steps",
+    [
+        (
+            PpoLearner(
+                Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
+            ),
+            120,
+            120 * 256 * 4,
+        ),
+        (SacLearner(SAC, Aim()), 5, 2000 + 5 * 512 * 16),
+    ],
+    ids=["PPO", "SAC"],
+)
+def test_a_learner_comes_near_the_best_action(learner, pieces, steps):
     seen = []
 
     def observe(controller, counts):
