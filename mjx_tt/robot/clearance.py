@@ -1,8 +1,8 @@
 """Clearances of the robot from the table and from itself, by capsules, as element-wise operations over the batch.
 
-Segment to segment is the robot's own formula. Segment to box: the squared distance is convex along the segment, its
-derivative is found zero by bisection; the exact form of ``robot_io.safety.clearance.Box``, with which a test compares
-it, sorts and indexes, which would leave the vector loops.
+Segment to box: the squared distance is convex along the segment, its derivative is found zero by bisection. The robot's
+own ``robot_io.safety.clearance``, with which a test compares both distances, branches, which would leave the vector
+loops.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
 from mjx_tt.robot.mjcf import Capsule
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.robot_file import RobotFile
-from robot_io.safety.clearance import segment_distance
 
+PARALLEL = 1e-12  # segments more parallel than this are taken as parallel
 BISECTIONS = 10  # of a link of 0.3 m: 0.3 mm along it, micrometres in distance
 
 
@@ -43,6 +43,22 @@ def segment_box_distance(
     for s in (jnp.zeros_like(low), 0.5 * (low + high), jnp.ones_like(low)):
         best = jnp.minimum(best, box_gap(box, 0.0, p + s[None] * d)[1])
     return best
+
+
+def segment_distance(p1: jax.Array, q1: jax.Array, p2: jax.Array, q2: jax.Array) -> jax.Array:
+    """Distance [m], (...), of segments p1-q1 and p2-q2, each end (3, ...).
+
+    Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
+    """
+    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
+    a, e, b = dot(d1, d1), dot(d2, d2), dot(d1, d2)
+    f, c = dot(d2, r), dot(d1, r)
+    denominator = a * e - b * b
+    s = jnp.where(denominator > PARALLEL, (b * f - c * e) / jnp.maximum(denominator, PARALLEL), 0.0)
+    t = jnp.clip((b * jnp.clip(s, 0.0, 1.0) + f) / jnp.maximum(e, PARALLEL), 0.0, 1.0)
+    s = jnp.clip((b * t - c) / jnp.maximum(a, PARALLEL), 0.0, 1.0)
+    gap = r + s[None] * d1 - t[None] * d2
+    return jnp.sqrt(dot(gap, gap))
 
 
 @jax.tree_util.register_dataclass
@@ -98,7 +114,7 @@ class CapsuleClearance:
             return Clearances(_least(to_table), jnp.full_like(blade, jnp.inf), blade)
         p1, q1, radius1 = gather([first for first, _ in file.pairs])
         p2, q2, radius2 = gather([second for _, second in file.pairs])
-        own = segment_distance(p1, q1, p2, q2, xp=jnp) - radius1 - radius2
+        own = segment_distance(p1, q1, p2, q2) - radius1 - radius2
         return Clearances(_least(to_table), _least(own), blade)
 
 

@@ -37,6 +37,7 @@ from robot_io.policy import artefact as artefacts
 from robot_io.policy.backends import choose, make_policy
 from robot_io.policy.policy import Policy
 from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.config import SLACK
 from robot_io.safety.gate import SafetyGate
 
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
@@ -146,10 +147,12 @@ class Control:
 
     @staticmethod
     def _warm_up(policy: StepPolicy, gate: SafetyGate) -> None:
-        """First calls import and allocate: not in the loop."""
+        """First calls import, load machine code and allocate: not in the loop."""
         for _ in range(20):
             policy.step(np.zeros(3 + len(gate.geometry.joints)))
-            gate.geometry.gaps(np.zeros((len(gate.geometry.joints), 8)))
+            geometry, way = gate.geometry, np.zeros((len(gate.geometry.joints), 8))
+            geometry.gaps(way), geometry.hand(way), geometry.first_too_close(way, gate.margins, SLACK)
+        np.linalg.lstsq(np.eye(4), np.ones(4), rcond=None)  # its library's buffer, once memory is locked, takes 0.1 s
         policy.reset()
 
     def run(self) -> None:

@@ -214,7 +214,7 @@ class LockStep:
         self.run(2.0, lambda: self.bridge.arm_session.ramping(self.now) is None)
 
     def recover(self) -> None:
-        """Reset a fault and arm again, as an operator does, who jogs the arm where needed; home is reached later.
+        """Reset a fault and arm again, as an operator does, who jogs the robot where needed; home is reached later.
 
         Raises RefusedError.
         """
@@ -241,8 +241,11 @@ class LockStep:
         try:
             self.bridge.arm(self.now)
         except JogFirstError:
-            self.world.jog()
+            self.axes.disable()
             self.run(0.5)
+            self.world.jog(whole=True)
+            self.axes.enable()
+            self.run(1.0)
             self.bridge.arm(self.now)
 
     def play(self, balls: int, longest: float = 20.0) -> list[EpisodeSummary]:

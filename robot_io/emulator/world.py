@@ -171,10 +171,13 @@ class World:
         site = self.data.site_xpos[self._site], self.data.site_xmat[self._site].reshape(3, 3)
         return site[0] + site[1] @ np.array(CLIP)
 
-    def jog(self) -> None:
-        """Puts the arm to its home pose, as somebody does with the controller's own pendant."""
-        arm = self._arm
-        self.data.qpos[self._q[arm]], self.data.qvel[self._v[arm]] = self.home[arm], 0.0
+    def jog(self, whole: bool = False) -> None:
+        """Puts the arm to its home pose, as somebody does with the controller's own pendant.
+
+        whole: the linear axes as well, which are pushed by hand, without power.
+        """
+        joints = slice(None) if whole else self._arm
+        self.data.qpos[self._q[joints]], self.data.qvel[self._v[joints]] = self.home[joints], 0.0
         mujoco.mj_forward(self.model, self.data)
 
     def hold(self, joint: int, place: float) -> None:

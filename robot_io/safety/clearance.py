@@ -1,4 +1,4 @@
-"""Positions of the robot's capsules and their distances from the table, the floor and each other. NumPy, float64.
+"""Positions of the robot's capsules and their distances from the table, the floor and each other, in float64.
 
 ``robot_geometry.json`` (format 1) is written from the MJCF by ``python -m mjx_tt.robot.geometry_export``:
     joints          in the contract's order: name, type (slide or hinge), unit axis, pos and rot of the joint's frame in
@@ -16,18 +16,15 @@ from __future__ import annotations
 import copy
 import json
 import math
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from types import ModuleType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot_io.calibrated import Frame
 from robot_io.contract import JOINT_NAMES, PAPER, Contract
-
-Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
+from robot_io.safety.capsules import find_too_close, measure_all, place_ends, place_frames
 
 FORMAT = 1
 SHIPPED = "robot_geometry.json"
@@ -37,8 +34,6 @@ WORST = 4  # vectors beside a way that are looked at along all of it
 LEVELS = 5  # halvings of a stretch before it counts as too close
 
 _KEYS = ("format", "joints", "capsules", "table", "floor", "table_capsules", "blade_capsules", "self_pairs", "home")
-_TINY = 1e-12  # as in the simulation: segments more parallel than this are taken as parallel
-_NO_WAY = 1e-30  # stands for a direction component of 0 in quotients
 
 
 class GeometryError(ValueError):
@@ -51,65 +46,6 @@ class Clearances(NamedTuple):
     table: np.ndarray  # any watched capsule to the table top
     own: np.ndarray  # any watched pair of capsules
     blade: np.ndarray  # the blade to the table top
-
-
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box: low and high corners (3, 1, 1) [m]."""
-
-    low: np.ndarray
-    high: np.ndarray
-
-    def distance(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Distance [m], (n, B), of segments p-q, ends (3, n, B); 0 where they meet. Exact.
-
-        The simulation's ``mjx_tt.robot.clearance.segment_box_distance`` bisects instead, in a form without sorting and
-        indexing that the compiler turns into vector loops; a test compares the two.
-
-        Along a segment the squared distance is convex and its derivative linear between the points where a coordinate
-        enters or leaves its slab: interpolating between the two such points around the zero finds the minimum.
-        """
-        d = q - p
-        inverse = 1.0 / np.where(np.abs(d) < _NO_WAY, _NO_WAY, d)
-        kinks = np.concatenate([(self.low - p) * inverse, (self.high - p) * inverse])
-        t = np.empty((8, *p.shape[1:]))
-        t[0], t[1] = 0.0, 1.0
-        np.clip(kinks, 0.0, 1.0, out=t[2:])
-        slope = np.einsum("xknb,xnb->knb", self._gap(p[:, None] + t * d[:, None]), d)
-        falling = slope <= 0.0
-        t_low, t_high = np.where(falling, t, 0.0).max(0), np.where(falling, 1.0, t).min(0)
-        s_low, s_high = np.where(falling, slope, -np.inf).max(0), np.where(falling, np.inf, slope).min(0)
-        inside = np.isfinite(s_low) & np.isfinite(s_high)
-        share = -np.where(inside, s_low, 0.0) / np.where(inside, s_high - s_low, 1.0)
-        best = np.where(np.isfinite(s_low), np.where(inside, t_low + share * (t_high - t_low), 1.0), 0.0)
-        gap = self._gap(p + best * d)
-        return np.sqrt(np.einsum("xnb,xnb->nb", gap, gap))
-
-    def _gap(self, point: np.ndarray) -> np.ndarray:
-        """From the nearest point of the box to ``point`` (3, ..., n, B)."""
-        extra = (1,) * (point.ndim - 3)
-        low, high = (corner.reshape(3, *extra, 1, 1) for corner in (self.low, self.high))
-        return point - np.minimum(np.maximum(point, low), high)
-
-
-def segment_distance(p1: Array, q1: Array, p2: Array, q2: Array, xp: ModuleType = np) -> Array:
-    """Distance [m], (...), of segments p1-q1 and p2-q2, each end (3, ...); ``xp``: numpy or jax.numpy.
-
-    Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
-    """
-    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
-    a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
-    f, c = _dot(d2, r), _dot(d1, r)
-    denominator = a * e - b * b
-    s = xp.where(denominator > _TINY, (b * f - c * e) / xp.maximum(denominator, _TINY), 0.0)
-    t = xp.clip((b * xp.clip(s, 0.0, 1.0) + f) / xp.maximum(e, _TINY), 0.0, 1.0)
-    s = xp.clip((b * t - c) / xp.maximum(a, _TINY), 0.0, 1.0)
-    gap = r + s[None] * d1 - t[None] * d2
-    return xp.sqrt(_dot(gap, gap))
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 class RobotGeometry:
@@ -127,29 +63,26 @@ class RobotGeometry:
         self.joints = _check(data, where, joints)
         self.units = tuple("m" if joint["type"] == "slide" else "rad" for joint in data["joints"])
         self.home = np.array(data["home"], float)
-        self._basis = _transform_basis(data["joints"])
-        self._hinge = np.array([[joint["type"] == "hinge"] for joint in data["joints"]], float)
+        hinge = np.array([joint["type"] == "hinge" for joint in data["joints"]], float)
         capsules = {c["name"]: c for c in data["capsules"]}
         watched, pairs, self.tip = data["table_capsules"], data["self_pairs"], data["blade_capsules"][0]
         unknown = sorted({*watched, *data["blade_capsules"], *(n for pair in pairs for n in pair)} - capsules.keys())
         if unknown:
             raise GeometryError(f"{where}: no capsules named {unknown}; it has {sorted(capsules)}")
         order = self._names = list(capsules)
-        self._fixed = any(capsules[n]["joint"] == FIXED for n in order)
-        self._base = np.eye(4)  # of what nothing moves
-        self._joint = np.array([(*self.joints, FIXED).index(capsules[n]["joint"]) for n in order])
-        local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order])
-        self._local = local.swapaxes(1, 2)[:, None]  # (capsules, 1, 4, 2)
-        self._radius = np.array([capsules[n]["radius"] for n in order], float)[:, None]
+        joint = np.array([(*self.joints, FIXED).index(capsules[n]["joint"]) for n in order])
+        local = np.array([[capsules[n][end] for end in ("p0", "p1")] for n in order], float)
+        self._chain = (_transform_basis(data["joints"]), np.eye(4), joint, local)  # the second: of what nothing moves
+        radius = np.array([capsules[n]["radius"] for n in order], float)
         self._table_rows = np.array([order.index(n) for n in watched])
         self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
-        self._first = np.array([order.index(a) for a, _ in pairs], int)
-        self._second = np.array([order.index(b) for _, b in pairs], int)
-        centre, half = (np.array(data["table"][key], float).reshape(3, 1, 1) for key in ("centre", "half"))
-        self._floor = float(data["floor"])
-        self._top = Box(centre - half, centre + half)
+        first, second = (np.array([order.index(pair[i]) for pair in pairs], int) for i in (0, 1))
+        centre, half = (np.array(data["table"][key], float) for key in ("centre", "half"))
+        floor = float(data["floor"])
+        top = np.stack([centre - half, centre + half])
         # Frame and legs are not modelled one by one: nothing of the arm belongs under the table.
-        self._block = Box(np.concatenate([self._top.low[:2], [[[self._floor]]]]), self._top.high)
+        block = np.stack([np.array([*top[0, :2], floor]), top[1]])
+        self._top, self._watch = top, (self._table_rows, first, second, radius, block, floor)
         self.rows = (
             *(f"{n} to the table" for n in watched),
             *(f"{a} to {b}" for a, b in pairs),
@@ -157,7 +90,8 @@ class RobotGeometry:
         )
         self.kinds = np.array(["table"] * len(watched) + ["self"] * len(pairs) + ["floor"] * len(watched))
         last = [-1 if capsules[n]["joint"] == FIXED else self.joints.index(capsules[n]["joint"]) for n in order]
-        self._levers = _levers(data["joints"], [(i, capsules[n]) for i, n in zip(last, order, strict=True)])
+        levers = _levers(data["joints"], [(i, capsules[n]) for i, n in zip(last, order, strict=True)])
+        self._bounds = (hinge, levers)
 
     @classmethod
     def of(cls, contract: Contract) -> RobotGeometry:
@@ -186,53 +120,39 @@ class RobotGeometry:
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = base.matrix, base.position
         other = copy.copy(self)
-        other._base = place
-        other._basis = self._basis.copy()
-        other._basis[0] = (place @ self._basis[0].reshape(4, 4, 4)).reshape(4, 16)
+        basis, _, joint, local = self._chain
+        basis = basis.copy()
+        basis[0] = place @ basis[0]
+        other._chain = (basis, place, joint, local)
         return other
 
     def hand(self, q: np.ndarray) -> np.ndarray:
         """Transforms (B, 4, 4) from the last joint's frame to the world at joint positions q (n, B)."""
-        return self._frames(q)[-1]
-
-    def _frames(self, q: np.ndarray) -> np.ndarray:
-        """Transforms (n, B, 4, 4) from every joint's frame to the world."""
-        n, joints = q.shape[1], len(self.joints)
-        values = np.stack([np.ones_like(q), np.sin(q), 1.0 - np.cos(q), q], axis=-1)  # (8, B, 4)
-        local = np.matmul(values, self._basis).reshape(joints, n, 4, 4)
-        world = np.empty_like(local)
-        world[0] = local[0]
-        for i in range(1, joints):
-            np.matmul(world[i - 1], local[i], out=world[i])
-        return world
+        return place_frames(np.array(q, float, order="C"), *self._chain[:2])[:, -2]
 
     def ends(self, q: np.ndarray) -> np.ndarray:
-        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (n, B)."""
-        world = self._frames(q)
-        if self._fixed:
-            world = np.concatenate([world, np.broadcast_to(self._base, (1, *world.shape[1:]))])
-        points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
-        return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
+        """World end points (B, capsules, 2, 3) of every capsule's axis at joint positions q (n, B)."""
+        return place_ends(np.array(q, float, order="C"), *self._chain)
 
     @property
     def blade(self) -> np.ndarray:
         """The blade's centre (3,) [m] in the last joint's frame."""
-        return self._local[self._names.index(self.tip), 0, :3].mean(axis=1)
+        return self._chain[3][self._names.index(self.tip)].mean(axis=0)
 
     @property
     def normal(self) -> np.ndarray:
         """The blade's normal (3,) in the last joint's frame, either way; almost 0 where its capsules are parallel."""
-        a, b = np.diff(self._local[self._table_rows[self._blade_rows[[0, -1]]], 0, :3])[..., 0]
-        return np.cross(a, b) / max(float(np.linalg.norm(np.cross(a, b))), _TINY)
+        a, b = np.diff(self._chain[3][self._table_rows[self._blade_rows[[0, -1]]]], axis=1)[:, 0]
+        return np.cross(a, b) / max(float(np.linalg.norm(np.cross(a, b))), 1e-12)
 
     def blade_points(self, q: np.ndarray) -> np.ndarray:
         """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (n, B)."""
-        ends = self.ends(q)[:, :, self._table_rows[self._blade_rows]]
-        return ends.swapaxes(0, 1).reshape(3, -1, q.shape[1])
+        ends = self.ends(q)[:, self._table_rows[self._blade_rows]]
+        return ends.transpose(3, 2, 1, 0).reshape(3, -1, q.shape[1])
 
     def middles(self, capsule: str, q: np.ndarray) -> np.ndarray:
         """World positions (3, B) [m] of the middle of a capsule's axis at joint positions q (n, B)."""
-        return self.ends(q)[:, :, self._names.index(capsule)].mean(axis=0)
+        return self.ends(q)[:, self._names.index(capsule)].mean(axis=1).T
 
     def middle(self, capsule: str, q: np.ndarray) -> np.ndarray:
         """As ``middles`` at joint positions q (n,): (3,)."""
@@ -240,16 +160,17 @@ class RobotGeometry:
 
     def clearances(self, q: np.ndarray) -> Clearances:
         """The simulation's clearances at joint positions q (n, B)."""
-        ends = self.ends(np.asarray(q, float))
-        table = self._to_box(self._top, ends)
-        return Clearances(table.min(0), self._own(ends).min(0, initial=np.inf), table[self._blade_rows].min(0))
+        watched, first, second, radius, _, floor = self._watch
+        gaps = measure_all(self.ends(q), (watched, first, second, radius, self._top, floor))
+        table, own = gaps[: len(watched)], gaps[len(watched) : -len(watched)]
+        return Clearances(table.min(0), own.min(0, initial=np.inf), table[self._blade_rows].min(0))
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
         """Every watched gap (R, B) [m] in the order of ``rows`` at q (n, B).
 
         Here the table reaches down to the floor, so a gap to it is never larger than ``clearances`` says.
         """
-        return self._gaps(self.ends(q))
+        return measure_all(self.ends(q), self._watch)
 
     def first_too_close(self, q: np.ndarray, margin: np.ndarray, slack: float) -> int | None:
         """Row of a gap that may come too close on the way q (n, N), straight between its points; None: proven clear.
@@ -261,33 +182,9 @@ class RobotGeometry:
         stays above (g_0 + g_1 - chord) / 2. Stretches that this does not clear are halved up to ``LEVELS`` times; what
         is unclear then counts as too close.
         """
-        ends = self.ends(q)
-        gaps = self._gaps(ends)
-        least = np.minimum(margin, gaps[:, 0])[:, None]
-        low = ~(gaps >= least).all(1)  # so that NaN is too close
-        if low.any():
-            return int(low.argmax())
-        least = least - slack
-        a, b = slice(None, -1), slice(1, None)
-        q0, q1, e0, e1, g0, g1 = q[:, a], q[:, b], ends[..., a], ends[..., b], gaps[:, a], gaps[:, b]
-        for level in range(LEVELS + 1):
-            unclear = ~(0.5 * (g0 + g1 - self._chord(e1 - e0)) - self._bulge(q1 - q0) >= least)
-            some = unclear.any(0)
-            if not some.any():
-                return None
-            if level == LEVELS:
-                break
-            q0, q1, e0, e1, g0, g1 = (x[..., some] for x in (q0, q1, e0, e1, g0, g1))
-            middle = 0.5 * (q0 + q1)
-            ends = self.ends(middle)
-            gaps = self._gaps(ends)
-            low = ~(gaps >= least).all(1)
-            if low.any():
-                return int(low.argmax())
-            q0, q1 = np.concatenate([q0, middle], -1), np.concatenate([middle, q1], -1)
-            e0, e1 = np.concatenate([e0, ends], -1), np.concatenate([ends, e1], -1)
-            g0, g1 = np.concatenate([g0, gaps], -1), np.concatenate([gaps, g1], -1)
-        return int(unclear.any(1).argmax())
+        way = np.array(q, float, order="C")
+        row = find_too_close(way, margin, slack, LEVELS, self._chain, self._watch, self._bounds)
+        return None if row < 0 else int(row)
 
     def clear_beside(self, way: np.ndarray, beside: np.ndarray, margin: np.ndarray) -> bool:
         """True when a robot that goes beside the way (n, N) by any of the vectors (n, K) keeps gaps of ``margin`` (R,).
@@ -301,39 +198,9 @@ class RobotGeometry:
         gaps = self.gaps(q.reshape(len(self.joints), -1)).reshape(-1, *q.shape[1:])
         return bool((gaps >= np.minimum(margin[:, None], gaps[..., 0])[..., None]).all())
 
-    def _to_box(self, box: Box, ends: np.ndarray) -> np.ndarray:
-        some = ends[:, :, self._table_rows]
-        return box.distance(some[0], some[1]) - self._radius[self._table_rows]
-
-    def _own(self, ends: np.ndarray) -> np.ndarray:
-        if not self._first.size:
-            return np.zeros((0, ends.shape[-1]))
-        first, second = ends[:, :, self._first], ends[:, :, self._second]
-        distance = segment_distance(first[0], first[1], second[0], second[1])
-        return distance - self._radius[self._first] - self._radius[self._second]
-
-    def _gaps(self, ends: np.ndarray) -> np.ndarray:
-        floor = ends[:, 2, self._table_rows].min(0) - self._radius[self._table_rows] - self._floor
-        return np.concatenate([self._to_box(self._block, ends), self._own(ends), floor])
-
-    def _chord(self, moved: np.ndarray) -> np.ndarray:
-        """Longest chord (R, B) of any point of what a row is between, from the ends' ways (2, 3, n, B)."""
-        alone = np.sqrt(np.einsum("exnb,exnb->enb", moved, moved).max(0))[self._table_rows]
-        relative = moved[:, None, :, self._first] - moved[None, :, :, self._second]
-        pairs = np.sqrt(np.einsum("efxnb,efxnb->efnb", relative, relative).max((0, 1)))
-        return np.concatenate([alone, pairs, alone])
-
-    def _bulge(self, dq: np.ndarray) -> np.ndarray:
-        """Bounds (R, B) of a row's gap against that along the chords, for joints moving straight by dq (n, B)."""
-        size = np.abs(dq) * self._hinge
-        inner = np.cumsum(size, axis=0) - size
-        bulge = self._levers @ (size * (size + 2.0 * inner)) / 8.0  # (capsules, B)
-        alone = bulge[self._table_rows]
-        return np.concatenate([alone, bulge[self._first] + bulge[self._second], alone])
-
 
 def _transform_basis(joints: list[dict]) -> np.ndarray:
-    """(n, 4, 16): every joint's 4 x 4 transform is the sum of these times 1, sin q, 1 - cos q and q (Rodrigues)."""
+    """(n, 4, 4, 4): every joint's 4 x 4 transform is the sum of these times 1, sin q, 1 - cos q and q (Rodrigues)."""
     basis = np.zeros((len(joints), 4, 4, 4))
     for i, joint in enumerate(joints):
         rot, axis = np.array(joint["rot"], float), np.array(joint["axis"], float)
@@ -344,7 +211,7 @@ def _transform_basis(joints: list[dict]) -> np.ndarray:
             x, y, z = axis
             skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             basis[i, 1, :3, :3], basis[i, 2, :3, :3] = rot @ skew, rot @ skew @ skew
-    return basis.reshape(len(joints), 4, 16)
+    return basis
 
 
 def _levers(joints: list[dict], capsules: list[tuple[int, dict]]) -> np.ndarray:

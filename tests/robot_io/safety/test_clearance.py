@@ -15,7 +15,8 @@ from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 from robot_io.safety import clearance as shipped
-from robot_io.safety.clearance import Box, GeometryError, RobotGeometry, segment_distance
+from robot_io.safety.capsules import bound_bulges, box_distance, segment_distance
+from robot_io.safety.clearance import GeometryError, RobotGeometry
 
 LOWER, UPPER = np.array(LIMITS.lower)[:, None], np.array(LIMITS.upper)[:, None]
 N = 2000
@@ -106,7 +107,7 @@ def test_the_space_under_the_table_belongs_to_the_table(ours, poses):
 def test_box_distance_against_dense_sampling():
     """Segments in all directions, along the axes, of no length, through the box and touching it."""
     rng = np.random.default_rng(1)
-    box = Box(np.array([-0.5, -1.0, -0.2]).reshape(3, 1, 1), np.array([0.5, 1.0, 0.1]).reshape(3, 1, 1))
+    low, high = np.array([-0.5, -1.0, -0.2]), np.array([0.5, 1.0, 0.1])
     p, q = rng.uniform(-2, 2, (2, 3, 1, 1500))
     along = rng.integers(0, 3, 1000)
     q[:, 0, :1000] = p[:, 0, :1000]
@@ -114,9 +115,10 @@ def test_box_distance_against_dense_sampling():
     p[2, 0, 1000:1200] = q[2, 0, 1000:1200] = 0.1  # in the plane of the top
     s = np.linspace(0, 1, 2001)[:, None]
     points = p[:, 0, None] + s * (q - p)[:, 0, None]
-    outside = points - np.clip(points, box.low, box.high)
+    outside = points - np.clip(points, low[:, None, None], high[:, None, None])
     dense = np.sqrt((outside**2).sum(0).min(0))
-    found = box.distance(p, q)[0]
+    ends = np.ascontiguousarray(np.stack([p, q])[:, :, 0].transpose(0, 2, 1))
+    found = np.array([box_distance(low, high, a, b) for a, b in zip(*ends, strict=True)])
     step = np.linalg.norm((q - p)[:, 0], axis=0) / 2000
     assert (found <= dense + 1e-12).all() and (dense - found <= step / 2 + 1e-12).all()
     clear = dense > 0.05  # there the nearest point is found to second order
@@ -131,8 +133,8 @@ def test_segment_distance_by_hand():
         (([0, 0, 0], [1, 0, 0], [2, 1, 0], [4, 3, 0]), np.sqrt(2)),  # end to end
         (([0, 0, 0], [0, 0, 0], [3, 4, 0], [3, 4, 0]), 5.0),  # points
     ):
-        found = segment_distance(*(np.array(p, float).reshape(3, 1, 1) for p in points))
-        assert found[0, 0] == pytest.approx(wanted, abs=1e-12)
+        found = segment_distance(*(np.array(p, float) for p in points))
+        assert found == pytest.approx(wanted, abs=1e-12)
 
 
 def test_a_cleared_motion_is_clear_between_its_points(ours):
@@ -189,8 +191,8 @@ def test_no_point_leaves_its_chord_farther_than_allowed_for(ours):
     d = rng.uniform(-0.3, 0.3, a.shape) * rng.integers(0, 2, a.shape)
     a[:, 0], d[:, 0] = [0, 0, 0, 0, np.arctan(0.302 / 0.07), 0, 0, 0], [0, 0, 0, 0.1, 0.1, 0, 0, 0]
     away = ours.ends(a + d / 2) - 0.5 * (ours.ends(a) + ours.ends(a + d))
-    away = np.linalg.norm(away, axis=1).max(0)[ours._table_rows]  # the farther end of each capsule
-    allowed = ours._bulge(d)[: len(away)]
+    away = np.linalg.norm(away, axis=-1).max(-1).T  # the farther end of each capsule
+    allowed = np.array([bound_bulges(each, *ours._bounds) for each in np.ascontiguousarray(d.T)]).T
     assert (away <= allowed + 1e-12).all()
     assert (away / np.maximum(allowed, 1e-9))[:, 0].max() > 0.8
 
