@@ -103,13 +103,16 @@ def _first_ball(
 ) -> str:
     """Play one ball with the policy at the low speed. Raises NotProven."""
     with _session(config, contract, log_folder, console, policy) as session:
+        operator.do("switch_on", "start the arm's RAPID program again: EGM ended with the session before")
         session.prepare(None)
         operator.do("throw", "throw balls one by one from the player's end: three are watched, then the robot is armed")
         _until(session, lambda s: not s.unproven, "balls that show the tracker's frame")
-        session.arm()
+        session.send(messages.Arm())  # so slow a robot is rarely at its home pose between two balls
         end = time.monotonic() + 2.0 * WAIT
         while time.monotonic() < end:
             for message in session.messages(0.1):
+                if isinstance(message, messages.Refused):
+                    raise message.error
                 if isinstance(message, messages.Played):
                     operator.do("stop_throwing", "throw no more balls")
                     if message.summary.fault:

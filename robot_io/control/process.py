@@ -163,8 +163,9 @@ class Control:
             self._take_axes()  # known at once
         self.owner.pipe.send(messages.Ready([*report, self._computed]))
         self.bridge.event(time.monotonic(), log.Level.INFO, "policy", self._computed)
-        while any(self._tracker_socket.drain()):
-            pass  # frames that waited while this process started would be taken for those of a slow clock
+        # What waited while this process started would be taken for a slow clock, what found no room for lost packets.
+        while any([*self._tracker_socket.drain(), *self._arm_socket.drain()]):
+            pass
         try:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
