@@ -28,15 +28,18 @@ def test_the_robots_side_loads_without_jax():
     assert done.returncode == 0, done.stderr
 
 
-def test_the_robots_face_needs_numpy_only():
-    """Importing robot_io loads nothing heavy; what running a policy needs loads neither JAX nor a device's library."""
-    others = "jax", "mujoco", "pymodbus", "google", "mcap", "pydantic", "scipy"
-    light = "load_artefact SafetyGate GateState SafetyConfig Policy StreamingPolicy LIMITS RefusedError".split()
+def test_a_policy_needs_numpy_only_and_the_gate_numba():
+    """Importing robot_io loads nothing heavy; neither policy nor gate loads JAX or a device's library."""
+    others = "jax", "mujoco", "pymodbus", "google", "mcap", "pydantic"
+    light = "load_artefact SafetyConfig Policy StreamingPolicy LIMITS RefusedError".split()
     code = f"""
 import sys, robot_io
 assert 'numpy' not in sys.modules
 {"; ".join(f"robot_io.{name}" for name in light)}
-loaded = [m for m in {others} if m in sys.modules]
+loaded = [m for m in {(*others, "numba", "scipy")} if m in sys.modules]
+assert not loaded, loaded
+robot_io.SafetyGate, robot_io.GateState
+loaded = [m for m in {(*others, "scipy.linalg")} if m in sys.modules]  # numba asks scipy for its version
 assert not loaded, loaded
 [getattr(robot_io, name) for name in robot_io.__all__]
 assert 'jax' not in sys.modules and 'mujoco' not in sys.modules

@@ -150,9 +150,10 @@ class Control:
         """First calls import, load machine code and allocate: not in the loop."""
         for _ in range(20):
             policy.step(np.zeros(3 + len(gate.geometry.joints)))
-            geometry, way = gate.geometry, np.zeros((len(gate.geometry.joints), 8))
-            geometry.gaps(way), geometry.hand(way), geometry.first_too_close(way, gate.margins, SLACK)
-        np.linalg.lstsq(np.eye(4), np.ones(4), rcond=None)  # its library's buffer, once memory is locked, takes 0.1 s
+        way = np.zeros((len(gate.geometry.joints), 2))
+        gate.geometry.gaps(way)
+        gate.geometry.first_too_close(way, gate.margins, SLACK)
+        np.linalg.lstsq(np.eye(4), np.ones(4), rcond=None)  # once memory is locked, LAPACK's buffer takes 0.1 s
         policy.reset()
 
     def run(self) -> None:

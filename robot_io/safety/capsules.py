@@ -3,8 +3,8 @@
 The gate asks for thousands of distances in each control period, so these are machine code, which numba compiles at the
 first call and keeps on the disk. Arrays are float64.
 
-    chain   transforms of the joints, (n, 4, 4, 4) and (4, 4) for what nothing moves; of every capsule its joint and its
-            ends in the joint's frame (2, 3)
+    chain   transforms of the joints (n, 4, 4, 4) and of the robot's base (4, 4); of every capsule its joint, n for the
+            base, and its ends in the joint's frame (2, 3)
     watch   capsules that are watched, pairs (two arrays), radii, corners (2, 3) of a box, height of the floor
     bounds  (n,) 1 for a hinge, 0 for a slide; (capsules, n) levers of the hinges [m]
 """
@@ -22,27 +22,23 @@ machine_code = njit(cache=True, error_model="numpy")
 
 @machine_code
 def place_frames(q, basis, base):
-    """Transforms (B, n + 1, 4, 4) from every joint's frame to the world, and of what nothing moves, at q (n, B)."""
+    """Transforms (B, n + 1, 4, 4) to the world from every joint's frame, and from the base's, at q (n, B)."""
     n, count = q.shape
     world = np.empty((count, n + 1, 4, 4))
     local = np.empty((4, 4))
     for b in range(count):
         world[b, n] = base
         for i in range(n):
+            before = world[b, i - 1]  # at the first joint the last: the base
             sine, versine = math.sin(q[i, b]), 1.0 - math.cos(q[i, b])
             for r in range(4):
                 for c in range(4):
                     local[r, c] = basis[i, 0, r, c] + sine * basis[i, 1, r, c] + versine * basis[i, 2, r, c]
                     local[r, c] += q[i, b] * basis[i, 3, r, c]
-            if i == 0:
-                world[b, 0] = local
-                continue
             for r in range(4):
                 for c in range(4):
-                    total = 0.0
-                    for k in range(4):
-                        total += world[b, i - 1, r, k] * local[k, c]
-                    world[b, i, r, c] = total
+                    world[b, i, r, c] = before[r, 0] * local[0, c] + before[r, 1] * local[1, c]
+                    world[b, i, r, c] += before[r, 2] * local[2, c] + before[r, 3] * local[3, c]
     return world
 
 
@@ -137,10 +133,8 @@ def measure_gaps(ends, watched, first, second, radius, block, floor):
 @machine_code
 def measure_all(ends, watch):
     """Gaps (R, B) [m] of the capsules in every pose, ends (B, capsules, 2, 3)."""
-    first = measure_gaps(ends[0], *watch)
-    gaps = np.empty((len(first), len(ends)))
-    gaps[:, 0] = first
-    for b in range(1, len(ends)):
+    gaps = np.empty((2 * len(watch[0]) + len(watch[1]), len(ends)))
+    for b in range(len(ends)):
         gaps[:, b] = measure_gaps(ends[b], *watch)
     return gaps
 
@@ -155,6 +149,15 @@ def bound_bulges(dq, hinge, levers):
             bulge[c] += levers[c, i] * (size * (size + 2.0 * inner) / 8.0)
         inner += size
     return bulge
+
+
+@machine_code
+def _below(gaps, least):
+    """The first row whose gap is less than its least one, or no number; -1: none."""
+    for row in range(len(gaps)):
+        if not gaps[row] >= least[row]:
+            return row
+    return -1
 
 
 @machine_code
@@ -196,16 +199,16 @@ def find_too_close(q, margin, slack, levels, chain, watch, bounds):
     g0 = measure_gaps(e0, *watch)
     least = np.minimum(margin, g0)
     lowest = least - slack
-    for row in range(len(margin)):
-        if not g0[row] >= least[row]:
-            return row
+    row = _below(g0, least)
+    if row >= 0:
+        return row
     for point in range(1, q.shape[1]):
         top, depth[0] = 0, 0
         at[0], places[0] = q[:, point], ends[point]
         gaps[0] = measure_gaps(ends[point], *watch)
-        for row in range(len(margin)):
-            if not gaps[0, row] >= least[row]:
-                return row
+        row = _below(gaps[0], least)
+        if row >= 0:
+            return row
         while top >= 0:
             bulge = bound_bulges(at[top] - q0, *bounds)
             row = _unclear(e0, places[top], g0, gaps[top], bulge, lowest, *watch[:3])
@@ -221,7 +224,7 @@ def find_too_close(q, margin, slack, levels, chain, watch, bounds):
             places[top + 1] = place_ends(at[top + 1].reshape(-1, 1), *chain)[0]
             top += 1
             gaps[top] = measure_gaps(places[top], *watch)
-            for row in range(len(margin)):
-                if not gaps[top, row] >= lowest[row]:
-                    return row
+            row = _below(gaps[top], lowest)
+            if row >= 0:
+                return row
     return -1

@@ -18,7 +18,7 @@ import json
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -38,14 +38,6 @@ _KEYS = ("format", "joints", "capsules", "table", "floor", "table_capsules", "bl
 
 class GeometryError(ValueError):
     """The geometry file cannot be used: the message names the file, what was found and what to do."""
-
-
-class Clearances(NamedTuple):
-    """Smallest gaps [m], each (B,), as the simulation's reward knows them."""
-
-    table: np.ndarray  # any watched capsule to the table top
-    own: np.ndarray  # any watched pair of capsules
-    blade: np.ndarray  # the blade to the table top
 
 
 class RobotGeometry:
@@ -72,17 +64,16 @@ class RobotGeometry:
         order = self._names = list(capsules)
         joint = np.array([(*self.joints, FIXED).index(capsules[n]["joint"]) for n in order])
         local = np.array([[capsules[n][end] for end in ("p0", "p1")] for n in order], float)
-        self._chain = (_transform_basis(data["joints"]), np.eye(4), joint, local)  # the second: of what nothing moves
+        self._chain = (_transform_basis(data["joints"]), np.eye(4), joint, local)
         radius = np.array([capsules[n]["radius"] for n in order], float)
         self._table_rows = np.array([order.index(n) for n in watched])
         self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
         first, second = (np.array([order.index(pair[i]) for pair in pairs], int) for i in (0, 1))
         centre, half = (np.array(data["table"][key], float) for key in ("centre", "half"))
         floor = float(data["floor"])
-        top = np.stack([centre - half, centre + half])
         # Frame and legs are not modelled one by one: nothing of the arm belongs under the table.
-        block = np.stack([np.array([*top[0, :2], floor]), top[1]])
-        self._top, self._watch = top, (self._table_rows, first, second, radius, block, floor)
+        block = np.stack([np.append((centre - half)[:2], floor), centre + half])
+        self._watch = (self._table_rows, first, second, radius, block, floor)
         self.rows = (
             *(f"{n} to the table" for n in watched),
             *(f"{a} to {b}" for a, b in pairs),
@@ -120,10 +111,7 @@ class RobotGeometry:
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = base.matrix, base.position
         other = copy.copy(self)
-        basis, _, joint, local = self._chain
-        basis = basis.copy()
-        basis[0] = place @ basis[0]
-        other._chain = (basis, place, joint, local)
+        other._chain = (self._chain[0], place, *self._chain[2:])
         return other
 
     def hand(self, q: np.ndarray) -> np.ndarray:
@@ -158,17 +146,10 @@ class RobotGeometry:
         """As ``middles`` at joint positions q (n,): (3,)."""
         return self.middles(capsule, q[:, None])[:, 0]
 
-    def clearances(self, q: np.ndarray) -> Clearances:
-        """The simulation's clearances at joint positions q (n, B)."""
-        watched, first, second, radius, _, floor = self._watch
-        gaps = measure_all(self.ends(q), (watched, first, second, radius, self._top, floor))
-        table, own = gaps[: len(watched)], gaps[len(watched) : -len(watched)]
-        return Clearances(table.min(0), own.min(0, initial=np.inf), table[self._blade_rows].min(0))
-
     def gaps(self, q: np.ndarray) -> np.ndarray:
         """Every watched gap (R, B) [m] in the order of ``rows`` at q (n, B).
 
-        Here the table reaches down to the floor, so a gap to it is never larger than ``clearances`` says.
+        The table reaches down to the floor here, so a gap to it is never larger than the simulation's.
         """
         return measure_all(self.ends(q), self._watch)
 

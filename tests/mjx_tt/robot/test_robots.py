@@ -15,6 +15,7 @@ from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io import contract
 from robot_io.contract import PAPER
 from robot_io.safety.clearance import RobotGeometry
+from tests.support.clearances import clearances
 
 NAMES = robots.names()
 OTHERS = [name for name in NAMES if name != robots.DEFAULT]
@@ -74,9 +75,9 @@ def test_the_gates_geometry_is_the_simulations_and_mujocos(name):
         kinematics = PaddleKinematics(robot.chain(), robot.paddle())
         clearance = CapsuleClearance(kinematics, robot.capsules(), robot.file)
         simulated = jax.tree.map(np.asarray, jax.jit(lambda q: clearance(kinematics.links(q), q[0]))(q))
-    found = ours.clearances(q)
-    for mine, theirs in zip(found, (simulated.table, simulated.own, simulated.blade), strict=True):
-        np.testing.assert_allclose(mine, theirs, atol=1e-4)  # the simulation bisects
+    found = clearances(ours, q)
+    for name, mine in found.items():
+        np.testing.assert_allclose(mine, getattr(simulated, name), atol=1e-4)  # the simulation bisects
     data = mujoco.MjData(model)
     for i in range(100):
         data.qpos[:] = q[:, i]
@@ -86,7 +87,7 @@ def test_the_gates_geometry_is_the_simulations_and_mujocos(name):
             for a, b in robot.file.pairs
         )
         if own > 0.0:
-            assert found.own[i] == pytest.approx(own, abs=1e-6)
+            assert found["own"][i] == pytest.approx(own, abs=1e-6)
     np.testing.assert_allclose(ours.home, robot.home, atol=1e-12)
     assert (ours.gaps(robot.home[:, None]) > 0.0).all()
 

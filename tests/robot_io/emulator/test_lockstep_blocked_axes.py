@@ -12,9 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from robot_io.contract import LIMITS
 from robot_io.control.bridge import BridgeState
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
+from robot_io.errors import JogFirstError
 from tests.support.lockstep_play import Swing, Wild, playing
 
 JUMP = 0.005  # [m]
@@ -69,6 +71,25 @@ def test_a_blocked_carriage_is_neither_pushed_nor_jumps_when_it_is_free(axis, st
     state, push, jump = blocked(axis, holds_measured, stop)
     assert state is BridgeState.FAULT or stop is not None
     assert push < JUMP and jump < JUMP
+
+
+def test_an_axis_outside_its_range_is_pushed_back_by_hand_before_the_robot_is_armed():
+    rig = playing(Swing(0.5))
+    rig.throwing = False
+    rig.bridge.stop(rig.now)
+    rig.run(2.0, lambda: rig.bridge.state is BridgeState.DISARMED)
+    rig.axes.disable()
+    rig.run(0.5)
+    rig.world.hold(1, LIMITS.upper[1] - 0.001)
+    rig.axes.enable()
+    rig.run(1.0)
+    with pytest.raises(JogFirstError, match="gantry_y is at .* by hand without power"):
+        rig.bridge.arm(rig.now)
+    rig.recover()
+    assert rig.bridge.state is BridgeState.READY and not rig.bridge.gate.faults
+    before = rig.world.qpos
+    rig.run(1.0)
+    assert abs(rig.world.qpos - before).max() < JUMP  # nor does its drive go back to where it was
 
 
 @pytest.mark.slow
