@@ -40,10 +40,10 @@ class SafetyConfig:
     escape_speed     share of the velocity limits while a gap is smaller than its margin
     still            measured speed (8,) above which the robot counts as moving and is not armed
     overspeed        measured speed over its limit that is a fault; ``monitor.UNSCALED`` is added to a scaled limit
-    following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
-    delay            shortest and longest time from a command to the measurement of its effect
+    following_error  distance (8,) of a measured position from everywhere the reference was in the last ``delay``
     drive_delay      (8,) time from a command to the motion that it makes, lag included
     drive_delay_error  by which the delay of the arm and that of the linear axes may be wrong, each
+    feedback_delay   longest time from a motion to its measurement here
     following_ticks  commands in a row after which a following error is a fault
     late             longest time between two commands: so long the robot may go on with the last one, and that way and
                      braking after it are proven clear as well; more is a fault
@@ -65,9 +65,9 @@ class SafetyConfig:
     still: tuple[Annotated[float, Within(0.001, 0.1)], ...] = _each(*_STILL)
     overspeed: Annotated[float, Within(1.05, 2.0)] = 1.5
     following_error: tuple[Annotated[float, Within(0.005, 0.4)], ...] = _each(*_FOLLOWING_ERROR)
-    delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], Annotated[float, Within(0.0, 0.3, "s")]] = (0.0, 0.2)
     drive_delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], ...] = _each(*_DRIVE_DELAY)
     drive_delay_error: Annotated[float, Within(0.0, 0.05, "s")] = 0.017
+    feedback_delay: Annotated[float, Within(0.004, 0.1, "s")] = 0.05
     following_ticks: Annotated[int, Within(1, 6)] = 3
     silence: tuple[Annotated[float, Within(0.004, 10.0, "s")], ...] = _each(*_SILENCE)
     late: Annotated[float, Within(0.02, 0.1, "s")] = 0.03
@@ -107,5 +107,10 @@ class SafetyConfig:
                 raise ValueError(f"{name}: expected {count} positive numbers, got {values}")
         if not 0.0 <= self.drive_delay_error < math.inf:
             raise ValueError(f"drive_delay_error: expected 0 s or more, got {self.drive_delay_error}")
-        if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
-            raise ValueError(f"delay: expected a shortest and a longer time [s], got {self.delay}")
+        if not 0.0 < self.feedback_delay < math.inf:
+            raise ValueError(f"feedback_delay: expected a positive, finite time [s], got {self.feedback_delay}")
+
+    @property
+    def delay(self) -> float:
+        """Longest time [s] from a command to the measurement of its effect."""
+        return max(self.drive_delay) + self.drive_delay_error + self.feedback_delay

@@ -28,11 +28,12 @@ from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
 from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
-from robot_io.safety.ways import Silence, between, delayed, leads
+from robot_io.safety.ways import Silence, between, blocked, delayed, leads
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
+STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
 LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
@@ -450,6 +451,11 @@ class SafetyGate:
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             if self.geometry.first_too_close(ways + self._deviation[:, None], self._touch, SLACK) is not None:
                 return False
+        low, high = self._monitor.reach
+        gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
+        stuck = blocked(gone[:, ::-STRIDE], np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1)))
+        if self.geometry.first_too_close(stuck, self._touch, SLACK) is not None:
+            return False
         beside = self._monitor.beside
         if beside.size and not all(self.geometry.clear_beside(each, beside, self._touch) for each in (way, late)):
             return False

@@ -37,6 +37,7 @@ class FeedbackMonitor:
         self._tolerance = np.array(config.following_error)
         self._past: deque[tuple[float, np.ndarray]] = deque()  # times and references at the ends of periods
         self._low = self._high = np.zeros(len(limits.joints))  # of the references in the window
+        self.reach = self._low, self._high  # between which a joint may be, for all that is known
         self._off = 0  # measurements in a row with a following error
         self._beside: deque[tuple[float, np.ndarray]] = deque()  # times and deviations
 
@@ -48,7 +49,7 @@ class FeedbackMonitor:
     def sent(self, reference: np.ndarray, time: float) -> None:
         """The reference (8,) will be here at ``time``, on a straight way from the one before."""
         self._past.append((time, reference))
-        self._forget(time - self._config.delay[1] - EARLY)
+        self._forget(time - self._config.delay - EARLY)
 
     def past(self, now: float, span: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (N,) and references (8, N) of the last ``span`` seconds before ``now``, and the one before them."""
@@ -69,14 +70,14 @@ class FeedbackMonitor:
         return "" if gaps[row] > 0.0 else f"{self._geometry.rows[row]}: {gaps[row]:.4f} m"
 
     def unexplained(self, position: np.ndarray, now: float) -> np.ndarray:
-        """Distance (8,) of the measured position from every place where the reference was during the actuation delay.
+        """Distance (8,) of the measured position from every place where the reference was during the longest delay.
 
         Zero or less: the commands that are under way explain the position.
         """
-        shortest, longest = self._config.delay
-        self._forget(now - longest)
-        seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now - shortest]
+        self._forget(now - self._config.delay)
+        seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now]
         self._low, self._high = np.min(seen, axis=0), np.max(seen, axis=0)
+        self.reach = np.minimum(self._low, position), np.maximum(self._high, position)
         return np.maximum(self._low - position, position - self._high)
 
     def deviation(self, position: np.ndarray, now: float) -> np.ndarray:

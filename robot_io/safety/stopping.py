@@ -2,7 +2,7 @@
 
 A device goes on towards its reference, so a reference that stays ahead of a blocked joint keeps pushing, and leads the
 joint there when the obstacle goes away. While the gate brakes, a joint that follows keeps the way that was proven
-clear. A joint whose measurement the commands of the last ``delay[1]`` seconds do not explain may be led by its
+clear. A joint whose measurement the commands of the last ``delay`` seconds do not explain may be led by its
 reference no further than braking from its measured velocity takes it; every joint at rest takes its measured position.
 """
 
@@ -26,7 +26,7 @@ class StopReference:
         self._acceleration = np.array(limits.acceleration)
         self._fastest = config.overspeed * np.array(limits.velocity)
         self._still = np.array(config.still)
-        self._latency = config.delay[1]
+        self._latency = config.delay
         self._unexplained = np.array([UNEXPLAINED[unit] for unit in units])
         self._lost = np.zeros(len(units), bool)  # joints that were found not to follow in this stop
         self._at_rest_since = math.inf  # [s] of the commands

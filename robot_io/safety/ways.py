@@ -55,6 +55,19 @@ def delayed(
     return np.concatenate(ways, axis=1)
 
 
+def blocked(way: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Where the robot goes, (n, M), while one of its joints, each in turn, stands still and the others go a way (n, N).
+
+    low, high: (n,) between which a joint may stand unnoticed.
+    """
+    parts = [way[:, :1]]
+    for joint in range(len(way)):
+        there, back = way.copy(), way[:, ::-1].copy()
+        there[joint], back[joint] = low[joint], high[joint]
+        parts += [there, back, way[:, :1]]
+    return np.concatenate(parts, axis=1)
+
+
 class Silence:
     """Each device goes on with its last command until its own time-out, or until the computer speaks again.
 
