@@ -19,7 +19,6 @@ from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.faults import Cause, FaultLatch
-from robot_io.safety import gate
 from robot_io.safety.gate import GateState, SafetyConfig, SafetyGate
 
 T = 1 / 75
@@ -210,7 +209,7 @@ def test_the_robot_keeps_its_distance_while_its_drives_delays_are_off_by_what_th
     """A gate that takes all delays for equal lets the same attack touch."""
     assert closest_of_attack_on_delays(None, distances) > 0.01 - SLACK
     # Proofs against silence and blocked joints keep it away too.
-    monkeypatch.setattr(gate, "blocked", lambda way, low, high: way)
+    monkeypatch.setattr("robot_io.safety.gate.blocked", lambda way, low, high: way)
     equal = SafetyConfig(drive_delay=(0.071,) * 8, drive_delay_error=0.0, silence=(0.004,) * 8)
     assert closest_of_attack_on_delays(equal, distances) < 0.005
 
@@ -634,7 +633,7 @@ def gap_of_blocked(seed, delay=8):
 def test_a_joint_that_is_blocked_leads_the_others_into_nothing_before_it_is_noticed(monkeypatch):
     """One attack in two hundred: within the time from a command to its measurement, in which no fault can come."""
     assert min(gap_of_blocked(seed) for seed in (4, 7, 190)) > 0.0
-    monkeypatch.setattr(gate, "blocked", lambda way, low, high: way)
+    monkeypatch.setattr("robot_io.safety.gate.blocked", lambda way, low, high: way)
     with pytest.raises(AssertionError, match="CLEARANCE"):
         gap_of_blocked(190)
 
