@@ -231,7 +231,8 @@ class LockStep:
             self.run(0.3)
         self.axes.enable()
         self.run(0.3)
-        self.run(3.0, lambda: not self.bridge.gate.present)
+        if not self.run(3.0, lambda: not self.bridge.gate.present):  # outside its range, or in contact
+            self._push_by_hand()
         if self.bridge.state is BridgeState.FAULT:
             self.bridge.reset(self.now)
         if not self.axes.homed:
@@ -241,12 +242,15 @@ class LockStep:
         try:
             self.bridge.arm(self.now)
         except JogFirstError:
-            self.axes.disable()
-            self.run(0.5)
-            self.world.jog(whole=True)
-            self.axes.enable()
-            self.run(1.0)
+            self._push_by_hand()
             self.bridge.arm(self.now)
+
+    def _push_by_hand(self) -> None:
+        self.axes.disable()
+        self.run(0.5)
+        self.world.jog(whole=True)
+        self.axes.enable()
+        self.run(1.0)
 
     def play(self, balls: int, longest: float = 20.0) -> list[EpisodeSummary]:
         """Plays until the outcomes of ``balls`` more balls are known; fewer when the bridge stops or time runs out."""

@@ -191,9 +191,6 @@ class SafetyGate:
         """
         if self._latch:
             raise RefusedError(f"not armed: {self._latch.first}; reset it first")
-        if self._latch.present:
-            listed = "; ".join(f"{cause.name}: {sentence}" for cause, sentence in self._latch.present.items())
-            raise RefusedError(f"not armed: {listed}")
         if self._mode is GateState.ARMED or not self.at_rest:
             raise RefusedError("not armed: it is armed or still stopping")
         if not math.isfinite(now):
@@ -212,6 +209,9 @@ class SafetyGate:
         touching = self._monitor.contact(position)
         if touching:
             raise JogFirstError(f"not armed: {touching}; jog it away")
+        if self._latch.present:
+            listed = "; ".join(f"{cause.name}: {sentence}" for cause, sentence in self._latch.present.items())
+            raise RefusedError(f"not armed: {listed}")
         given = self._measured_velocity if measured_velocity is None else measured_velocity
         if given is None:
             raise RefusedError("not armed: no measured velocity yet")
