@@ -41,7 +41,7 @@ def part(
     say: Callable[[str], None],
 ) -> Part:
     """The flights' part of the verdict. hits: the robot's hits are judged, which show the ball's latency."""
-    search, effects = found.search, found.problem.effects
+    search, picked, effects = found.search, found.search.picked, found.problem.effects
     named, beside = _causes(found, without)
     held_out = cross_validation.held_out(prediction, seed)
     unexplained = None
@@ -61,8 +61,8 @@ def part(
         tuple(quiet),
         experiment_design.experiments(found, pairs, dark),
         tuple(
-            {"effects": [effects[j].name for j in s], "gain": evidence - max(search.evidence)}
-            for s, evidence in zip(search.path, search.evidence, strict=True)
+            {"effects": [effects[j].name for j in s], "gain": evidence - max(picked.evidence)}
+            for s, evidence in zip(picked.path, picked.evidence, strict=True)
             if set(s) != set(search.chosen)
         ),
         (),
@@ -76,11 +76,11 @@ def part(
 def _left(found: BallFindings) -> Left:
     """What the extended model leaves, bounces all alike."""
     search = found.search
-    rest = search.remaining
+    rest = search.picked.remaining
     if found.companions:
         sizes = Sizes(found.problem, search.at, search.noise, search.prior)
         rest = sizes(sizes.theta(search.model, (*search.chosen, *found.companions)))
-    left, whole = (max(x[1] - search.level, 1e-12) for x in (rest, search.errors))
+    left, whole = (max(x[1] - search.level, 1e-12) for x in (rest, search.picked.errors))
     return Left(1e3 * float(np.sqrt(left)), float(left / whole), 1e3 * float(np.sqrt(whole)))
 
 
@@ -89,7 +89,7 @@ def _where(found: BallFindings, name: str) -> str:
     s = found.search
     columns = np.concatenate([f.columns for f in s.model.families if f.name == name])
     labels = [label for f in s.model.families if f.name == name for label in f.labels]
-    size = np.abs(s.left.coefficients[columns]) * np.sqrt(np.diagonal(s.model.total[0])[columns])
+    size = np.abs(s.picked.left.coefficients[columns]) * np.sqrt(np.diagonal(s.model.total[0])[columns])
     return labels[int(np.argmax(size))]
 
 
@@ -234,8 +234,9 @@ def _spin_cause(found: BallFindings, wide: float, error: Float[np.ndarray, " K"]
     rms = float(np.sqrt(np.sum(prior.std**2 + prior.mean**2)))
     text = "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading
     # Without spins, and all other causes, the nominal model is left.
-    most = max([search.remaining[1], *(w[1] for w in search.without.values())])
-    share = 1.0 - (most - search.level) / max(search.errors[1] - search.level, NO_ERROR)
+    picked = search.picked
+    most = max([picked.remaining[1], *(w[1] for w in picked.without.values())])
+    share = 1.0 - (most - search.level) / max(picked.errors[1] - search.level, NO_ERROR)
     cause = Cause("magnus", ("magnus",), 1.0, parameters, float(1e3 * rms * search.spin_shift), text, share)
     coefficient = {path: e for path, e in parameters.items() if path == MAGNUS}  # the spins are a distribution already
     return replace(Expressed.by(cause, parameters), ranges=Expressed.by(cause, coefficient).ranges)

@@ -78,7 +78,7 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     chosen = (*search.chosen, *found.companions)
     inside = [*search.model.always, *chosen]
     for f in range(FOLDS):
-        of_others = search.model.of_balls(np.flatnonzero(fold != f))
+        of_others = search.model.of_pieces(np.flatnonzero(fold != f))
         theta[np.ix_(inside, fold == f)] = of_others.solve(chosen)[0][inside, None]
     if problem.coefficient in search.model.always:
         theta[problem.coefficient] = np.clip(theta[problem.coefficient], *MAGNUS_RANGE)

@@ -16,20 +16,16 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.noise import Jitter
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
-from mjx_tt.diagnosis.ball.inclusion import Set
 from mjx_tt.diagnosis.ball.search import Search, Sessions, mean_square, search, spins_pay
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
+from mjx_tt.diagnosis.inclusion import LEAST_LEFT_SHARE, Set
 from mjx_tt.diagnosis.logs import before_racket
 from mjx_tt.sim.model import SimModel, with_values
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 6
 FLOOR = 0.003  # [m] shift of a flight's last sample below which a cause is of no practical interest
-LEAST_LEFT, LEAST_LEFT_SHARE = 0.0025, 0.2  # [m] of what no cause explains, on one ball in ten; share of the error
-HALVES = 20  # of the balls, by which a cause's confidence is told
-WIDE = 10.0  # times ordinary sizes, where only the flights are to speak
-ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
-TIE = 5.0  # of the logarithm of the evidence by which a cause must beat another in its place
+LEAST_LEFT = 0.0025  # [m] of what no cause explains, on one ball in ten
 FILTER = "tracker_filter"
 
 
@@ -140,8 +136,8 @@ def diagnose_balls(
         found,
         spin,
         named,
-        {j: _group(found, j) for j in found.chosen},
-        _confidence(found, rng),
+        {j: found.model.group(found.chosen, j) for j in found.chosen},
+        found.model.confidence(found.chosen, rng),
         left_out,
         patterns,
         unexplained,
@@ -181,49 +177,17 @@ def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float
     basis = np.linalg.qr(np.moveaxis(free.reshape(6, -1, g.n), (0, 1, 2), (2, 1, 0)))[0]
 
     def sizes(columns: np.ndarray) -> tuple[float, float]:
-        shown = np.where(g.mask, np.tensordot(found.left.coefficients[columns], found.columns[columns], 1), 0.0)
+        shown = np.where(g.mask, np.tensordot(found.picked.left.coefficients[columns], found.columns[columns], 1), 0.0)
         rows = shown.reshape(-1, g.n).T[..., None]
         rows = (rows - basis @ (basis.swapaxes(1, 2) @ rows)).reshape(g.n, 3, -1)
         square = (rows**2).sum(axis=1)
         return float(np.percentile(np.sqrt(square.max(axis=1)), 90)), float(np.sqrt(square.sum() / g.mask.sum()))
 
-    families = [f for f in found.model.families if found.left.coefficients[f.columns].any()]
+    families = [f for f in found.model.families if found.picked.left.coefficients[f.columns].any()]
     if not families:
         return (), 0.0, 0.0
     every = [Pattern(f.name, f.direction, *sizes(f.columns)) for f in families]
     return tuple(sorted(every, key=lambda p: -p.rms)), *sizes(np.concatenate([f.columns for f in families]))
-
-
-def _group(found: Search, member: int) -> Set:
-    """A chosen effect, and those that explain the flights as well in its place, or nearly in the same way."""
-    rest = tuple(c for c in found.chosen if c != member)
-    others = [c for c in found.model.candidates if c not in found.chosen]
-    # What the flights say, not what is ordinary.
-    wide = replace(found.model, scale=WIDE * found.model.scale)
-    evidence = wide.evidence([found.chosen, *((*rest, c) for c in others)])
-    gram, beside = found.model.total[0], [*rest, *found.model.always]
-    pair = [member, *others]
-    alone = gram[np.ix_(pair, pair)]
-    if beside:
-        mixed = gram[np.ix_(pair, beside)]
-        alone = alone - mixed @ np.linalg.solve(gram[np.ix_(beside, beside)], mixed.T)
-    cosine = np.abs(alone[0]) / np.sqrt(np.maximum(alone[0, 0] * np.diagonal(alone), 1e-300))
-    same = (evidence[0] - evidence[1:] < TIE) | (cosine[1:] > ALIKE)
-    return (member, *(c for c, alike in zip(others, same, strict=True) if alike))
-
-
-def _confidence(found: Search, rng: np.random.Generator) -> dict[int, float]:
-    """Share of random halves of the balls whose likeliest set holds each of the chosen effects, or one of its group."""
-    groups = {j: set(_group(found, j)) for j in found.chosen}
-    share = dict.fromkeys(found.chosen, 0)
-    n = len(found.model.ball_gram)
-    for _ in range(HALVES if share else 0):
-        half = found.model.of_balls(rng.permutation(n)[: n // 2])
-        path = half.best(len(found.chosen))
-        likeliest = set(path[int(np.argmax(half.evidence(path)))])
-        for j in share:
-            share[j] += bool(groups[j] & likeliest)
-    return {j: count / HALVES for j, count in share.items()}
 
 
 def jitter_cause(found: BallFindings) -> tuple[str, Jitter] | None:

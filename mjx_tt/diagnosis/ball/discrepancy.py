@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import Linear
-from mjx_tt.diagnosis.ball.inclusion import Family
+from mjx_tt.diagnosis.inclusion import Family
 
 DIRECTIONS = ("x", "y", "z", "along the flight")
 FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one

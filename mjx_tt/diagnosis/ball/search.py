@@ -7,7 +7,8 @@ model itself how much of the error each takes away: a cause is worth its name by
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,20 +21,15 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem, Linear, Situation, shifts
 from mjx_tt.diagnosis.ball.flights.noise import Noise, Whitening
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
-from mjx_tt.diagnosis.ball.inclusion import Family, Left, LinearModel, Set
+from mjx_tt.diagnosis.inclusion import Chosen, Family, Left, LinearModel, Set, choose
 
 ROUNDS = 8
 EARLY = 2  # of them, in which no cause has to be worth its name
-HALF = 0.5  # of all that the evidence gains, by which a single cause is looked at
 PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
-LEAST_SHARE = 0.01  # of the error, that a cause must take away
 NO_ERROR = 1e-6  # [m^2] beside the noise, below which there is nothing to take away: a millimetre
-LEADING_SHARE = 0.9  # of the error, beyond which a cause is named though a smooth function could stand for it
-LEAST_EVIDENCE = 2.0  # of the logarithm, that each cause must bring beside the best discrepancy
 PRICE_OF_SPINS = 20.0  # the same of a coefficient of lift and of the nine numbers of a distribution
 SPIKE, VISIBLE = 1e-4, 1.5e-5  # [m] by which what is not chosen may be off, at a flight's end and in rms of its samples
-MOST_CAUSES = 5
 FEW = 40  # balls, at most, by which sizes are told
 SCATTER = np.full(3, 0.1)  # [m/s] of bounces, before anything is known of it
 LEAST_KICK = 1e-3  # [m/s]
@@ -58,20 +54,19 @@ class Search:
     prior: SpinPrior | None  # of the spins, None where nothing spins
     model: LinearModel
     columns: Float[np.ndarray, "c 3 T n"]  # of the model
-    chosen: Set
-    path: Sequence[Set]  # the likeliest set of each number of causes
-    evidence: Sequence[float]  # theirs, beside the best discrepancy
-    left: Left  # beside the chosen
+    picked: Chosen
     shift: Float[np.ndarray, " K"]  # [m] median shift of a flight's last sample per unit of each effect
     spin_shift: float  # [m] the same per rad/s of spin
-    errors: Float[np.ndarray, 2]  # of the nominal model, see Sizes
-    remaining: Float[np.ndarray, 2]  # beside the chosen
-    without: dict[int, Float[np.ndarray, 2]] = field(default_factory=dict)  # with each of the chosen left out
-    level: float = 0.0  # of the noise
+    level: float  # of the noise
+
+    @property
+    def chosen(self) -> Set:
+        return self.picked.causes
 
     def share(self, member: int) -> float:
         """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
-        return float(np.max((self.without[member] - self.remaining) / np.maximum(self.errors - self.level, NO_ERROR)))
+        p = self.picked
+        return float(np.max((p.without[member] - p.remaining) / np.maximum(p.errors - self.level, NO_ERROR)))
 
 
 def search(
@@ -116,8 +111,9 @@ def search(
             left = _left(linear, change, columns, at, own, prior, g)
             own = replace(noise.estimate(left, frame, g, unknowns), scatter=scatter)
         sizes = Sizes(problem, at, own, prior)
-        picked = _choose(model, sizes, before, error, sizes.of(left, unknowns), round_ < EARLY)
-        chosen, path, evidence, beside, remaining, nominal, without = picked
+        level = sizes.of(left, unknowns)
+        picked = choose(model, partial(sizes.beside, model), before, error, level, NO_ERROR, round_ < EARLY)
+        chosen = picked.causes
         size, covariance, _ = model.solve(chosen)
         inside = [*model.always, *chosen]
         theta = sizes.theta(model, chosen)
@@ -134,10 +130,7 @@ def search(
             start = refit_worst(problem, theta, start, g, own, prior)
         at = Situation(theta, start)
     level = sizes.of(left, unknowns)
-    return Search(
-        at, linear, own, prior, model, columns, chosen, path, evidence, beside, shift, spin_shift, nominal, remaining,
-        without, level,
-    )  # fmt: skip
+    return Search(at, linear, own, prior, model, columns, picked, shift, spin_shift, level)
 
 
 def spins_pay(problem: BallProblem, plain: Search, at: Situation, prior: SpinPrior) -> bool:
@@ -184,7 +177,7 @@ def _linear_model(
         own = replace(own, scatter=scatter)
         shown = marginal.evidence(products, theta, prior, scatter, more)
         model = _about(problem, shown, theta, prior, own, families, candidates, shift)
-        model, everything = _tempered(model)
+        model, everything = model.tempered()
         theta = everything.coefficients
     return model, everything, own, prior
 
@@ -217,15 +210,6 @@ def _about(
     spike = np.minimum(spike, 0.3 * scale)
     low = np.array([e.low for e in problem.effects])
     return LinearModel(shown.ball_alone, right, middle, scale, spike, low, useful, candidates, always)
-
-
-def _tempered(model: LinearModel) -> tuple[LinearModel, Left]:
-    """The model, its evidence divided by how much more the balls' scores scatter than it says; and all it explains."""
-    k, everything = model.effects, model.beside(model.candidates)
-    score = model.ball_right[:, :k] - np.einsum("nkl,l->nk", model.ball_gram[:, :k], everything.coefficients)
-    ratio = (score**2).sum(axis=0) / np.maximum(np.diagonal(model.ball_gram.sum(axis=0))[:k], 1e-300)
-    typical = float(np.median(ratio[list(model.candidates)])) if model.candidates else 1.0
-    return replace(model, temper=max(typical, 1.0)), everything
 
 
 def _left(
@@ -284,6 +268,10 @@ class Sizes:
             theta[self.problem.coefficient] = np.clip(theta[self.problem.coefficient], *MAGNUS_RANGE)
         return theta
 
+    def beside(self, model: LinearModel, chosen: Set) -> Float[np.ndarray, 2]:
+        """Errors beside a set."""
+        return self(self.theta(model, chosen))
+
     def __call__(self, theta: Float[np.ndarray, " K"]) -> Float[np.ndarray, 2]:
         """After each ball's own start, and its spin where balls spin."""
         return np.array([self._of(theta, own) for own in (self.noise, replace(self.noise, scatter=noise.ALIKE))])
@@ -306,31 +294,3 @@ def mean_square(left: Float[np.ndarray, "3 T n"], g: Grid, unknowns: int) -> flo
     square, samples = (left**2).sum(axis=0)[g.mask], int(g.mask.sum())
     bounded = np.minimum(square, noise.OUTLIER * np.median(square)).mean()
     return float(bounded * samples / max(samples - unknowns * g.n / 3.0, 0.2 * samples))
-
-
-def _choose(
-    model: LinearModel, sizes: Sizes, before: Set, error: float, level: float, early: bool
-) -> tuple[Set, list[Set], list[float], Left, np.ndarray, np.ndarray, dict[int, np.ndarray]]:
-    """The likeliest set, as long as each of its causes takes away LEAST_SHARE of an error.
-
-    A set that was chosen before stays unless another is clearly better. early: sizes do not count yet.
-    error: [m^2] of the nominal model, level: of the noise.
-    """
-    path = model.best(MOST_CAUSES)
-    beside = [model.beside(s) for s in path]
-    evidence = np.array([b.evidence for b in beside])
-    held = np.array([LEAST_EVIDENCE if set(s) == set(before) else 0.0 for s in path])
-    count = int(np.argmax(evidence + held - LEAST_EVIDENCE * np.arange(len(path))))
-    alone = model.evidence(path[:2])
-    if early and count == 0 and alone[-1] - alone[0] > HALF * (evidence[0] - alone[0]):
-        count = 1  # to be looked at from there: what is far off is not told from here
-    errors = [sizes(sizes.theta(model, s)) for s in path[: max(count, 1) + 1]]
-    whole = np.maximum(errors[0], error) - level
-    gained = [float(np.max((a - b) / np.maximum(whole, NO_ERROR))) for a, b in zip(errors, errors[1:], strict=False)]
-    while not early and count and gained[count - 1] < LEAST_SHARE:
-        count -= 1
-    if count == 0 and gained and gained[0] > LEADING_SHARE:
-        count = 1
-    chosen = path[count]
-    without = {j: sizes(sizes.theta(model, tuple(c for c in chosen if c != j))) for j in chosen}
-    return chosen, path, evidence.tolist(), beside[count], errors[count], np.maximum(errors[0], error), without

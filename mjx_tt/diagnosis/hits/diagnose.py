@@ -17,13 +17,13 @@ from scipy.special import stdtr
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball.causes import estimates, quantile, readings
-from mjx_tt.diagnosis.ball.diagnose import TIE, BallFindings, flights
+from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
-from mjx_tt.diagnosis.ball.inclusion import LinearModel, Set
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
+from mjx_tt.diagnosis.inclusion import LinearModel, Set
 from mjx_tt.diagnosis.robust import deviation, huber_weights
 from mjx_tt.diagnosis.verdict import Cause, Expressed, Part
 
@@ -93,7 +93,7 @@ def diagnose_hits(
     causes = []
     for i, value, error in zip(chosen, values, errors, strict=True):
         if abs(value) * shift[i] >= LEAST_SHIFT:
-            rivals = _rivals(rated, chosen, i)
+            rivals = rated.group(chosen, i)[1:]
             causes.append(
                 HitCause(
                     effects[i],
@@ -218,11 +218,3 @@ def spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         covariance = (unit * weight) @ unit.T / weight.sum() + 0.05 * np.eye(len(left))
         root = np.linalg.inv(np.linalg.cholesky(covariance))
     return root / scale, weight
-
-
-def _rivals(model: LinearModel, chosen: Set, member: int) -> Set:
-    """Effects that explain the hits as well in place of a member."""
-    rest = tuple(c for c in chosen if c != member)
-    others = [c for c in model.candidates if c not in chosen]
-    evidence = model.evidence([chosen, *((*rest, c) for c in others)])
-    return tuple(c for c, e in zip(others, evidence[1:], strict=True) if evidence[0] - e < TIE)

@@ -7,17 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from mjx_tt.diagnosis.joint.findings import JointGain, JointResidual
-from mjx_tt.diagnosis.joint.fit import Fitter
+from mjx_tt.diagnosis.joint.fit import fit
 from mjx_tt.diagnosis.joint.log import JointLog
 
 DRAWS = 400  # of the windows, for an interval
 
 
-def held_out(fitter: Fitter, values: Mapping[str, float], sigma: float, rng: np.random.Generator) -> JointGain:
+def held_out(log: JointLog, values: Mapping[str, float], sigma: float, rng: np.random.Generator) -> JointGain:
     """Error in every second window of effects fitted to the others, from ``values``."""
-    log = fitter.log
     odd = log.window % 2 == 1
-    fitted = fitter.fit(values, sigma, mask=np.where(odd, 0.0, 1.0)).values if values and odd.any() else values
+    fitted = fit(log, values, sigma, np.where(odd, 0.0, 1.0)) if values and odd.any() else values
     before, after = (log.centred(log.measured - log.simulate(v)) for v in ({}, fitted))
     counts = np.diff(np.append(log.starts, log.time.size))
     chosen = np.arange(counts.size) % 2 == 1 if counts.size > 1 else np.ones(1, bool)

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 
 import numpy as np
 
-from mjx_tt.diagnosis.joint import cross_validation, selection
+from mjx_tt.diagnosis.inclusion import LEAST_LEFT_SHARE
+from mjx_tt.diagnosis.joint import cross_validation
 from mjx_tt.diagnosis.joint.coupling import coupling
-from mjx_tt.diagnosis.joint.effects import EFFECTS, NAMES, members
+from mjx_tt.diagnosis.joint.effects import BY_NAME, EFFECTS, NAMES, members
 from mjx_tt.diagnosis.joint.encoder_home import offset_at
 from mjx_tt.diagnosis.joint.experiment_design import separating, unseen
 from mjx_tt.diagnosis.joint.findings import JointFinding, JointFindings, merge
-from mjx_tt.diagnosis.joint.fit import Fitter, estimates, intervals
+from mjx_tt.diagnosis.joint.fit import SMALLEST_NOISE, estimates, fit, intervals, rms
 from mjx_tt.diagnosis.joint.forward_model import JointResponse
 from mjx_tt.diagnosis.joint.log import JointLog, JointRecord
-from mjx_tt.diagnosis.joint.selection import Choice
+from mjx_tt.diagnosis.joint.search import FLOOR, JointSearch, search
 from mjx_tt.diagnosis.verdict import Cause, Experiment, Expressed, HeldOut, Part, Unexplained
+
+SURE = 0.5  # share of half logs that a name must survive
 
 
 def diagnose_joints(
@@ -90,59 +92,72 @@ def _check(records: Sequence[JointRecord], nominal: Mapping, without: Sequence[s
 def _of_joint(log: JointLog, gone: set[str], home: float | None, rng: np.random.Generator) -> JointFindings:
     """Findings of one joint without the effects that are gone."""
     joint, allowed = log.record.joint, [e.name for e in EFFECTS if not gone.intersection(members(e.name))]
-    fitter = Fitter(log)
-    choice = selection.choose(fitter, allowed)
-    found = merge(
+    found = search(log, allowed) if log.fastest > 0.0 else None
+    named = {} if found is None else _named(log, found, rng)
+    told = merge(
         [
-            _causes(fitter, choice),
-            offset_at(home, log, choice, "joint_offset" not in gone),
-            unseen(log, choice, allowed),
-            _unexplained(log, choice),
-            _predictions(fitter, choice, rng),
+            JointFindings() if found is None else _causes(log, found, named),
+            offset_at(home, log, found, "joint_offset" not in gone),
+            unseen(log, found, named, allowed),
+            _predictions(log, found, named, rng),
         ]
     )
-    changes = {p.removeprefix(f"{joint}."): e.estimate for cause in found.causes for p, e in cause.parameters.items()}
-    return dataclasses.replace(found, responses={joint: dataclasses.replace(log.nominal, **changes)})
+    changes = {p.removeprefix(f"{joint}."): e.estimate for cause in told.causes for p, e in cause.parameters.items()}
+    return dataclasses.replace(told, responses={joint: dataclasses.replace(log.nominal, **changes)})
 
 
-def _causes(fitter: Fitter, choice: Choice) -> JointFindings:
-    log, joint = fitter.log, fitter.log.record.joint
-    ends = intervals(fitter, choice.fit, choice.judge) if choice.named else {}
-    causes = []
-    for effect, named in choice.named.items():
-        group = itertools.chain.from_iterable(map(members, (effect, *named.rivals)))
-        fitted = estimates(log, effect, choice.fit.values[effect], ends[effect])
+def _named(log: JointLog, found: JointSearch, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
+    """Of the chosen effects those of a size that matters and that most halves of the log show: each one's movement
+    [rad], [m] rms, and its confidence."""
+    confidence = found.model.confidence(found.picked.causes, rng)
+    moved = {}
+    for name, value in found.values.items():
+        rest = {n: v for n, v in found.values.items() if n != name}
+        movement = rms(log.centred(log.simulate(found.values) - log.simulate(rest)))
+        sure = confidence[found.names.index(name)]
+        if sure > SURE and movement >= FLOOR and abs(value - log.base[name]) >= BY_NAME[name].smallest:
+            moved[name] = movement, sure
+    return moved
+
+
+def _causes(log: JointLog, found: JointSearch, named: Mapping[str, tuple[float, float]]) -> JointFindings:
+    joint, chosen = log.record.joint, found.picked.causes
+    ends = intervals(log, found.values, found.sigma, found.model.temper) if named else {}
+    causes, experiments = [], []
+    for effect, (movement, confidence) in named.items():
+        k = found.names.index(effect)
+        rivals = [found.names[i] for i in found.model.group(chosen, k)[1:]]
+        fitted = estimates(log, effect, found.values[effect], ends[effect])
+        measurement = separating(log, effect, rivals)
         causes.append(
             Cause(
                 name=f"{joint}.{effect}",
-                group=tuple(f"{joint}.{name}" for name in group),
-                confidence=named.confidence,
+                group=tuple(f"{joint}.{name}" for e in (effect, *rivals) for name in members(e)),
+                confidence=confidence,
                 parameters={f"{joint}.{name}": estimate for name, estimate in fitted.items()},
-                effect_mm=1e3 * named.movement,
-                separating_measurement=separating(log, effect, named.rivals),
+                effect_mm=1e3 * movement,
+                separating_measurement=measurement,
+                share=found.share(effect),
             )
         )
-    experiments = (separating(log, effect, n.rivals) for effect, n in choice.named.items() if n.rivals)
-    return JointFindings(causes=tuple(causes), next_experiment=tuple(experiments))
+        experiments += [measurement] if rivals else []
+    left, whole = found.left, max(float(found.picked.errors[0]) - found.level, found.left**2)
+    open_: tuple[JointFinding, ...] = ()
+    if left > FLOOR and left**2 > LEAST_LEFT_SHARE * whole:
+        open_ = (JointFinding(joint, *found.pattern, 1e3 * left),)
+    return JointFindings(causes=tuple(causes), next_experiment=tuple(experiments), unexplained_by_joint=open_)
 
 
-def _unexplained(log: JointLog, choice: Choice) -> JointFindings:
-    joint, left = log.record.joint, choice.unexplained
-    if left is None:
-        return JointFindings()
-    block = f"{joint}: {left.block.name}"
-    return JointFindings(
-        unexplained_by_joint=(JointFinding(joint, block, left.where, left.direction, 1e3 * left.size),)
-    )
-
-
-def _predictions(fitter: Fitter, choice: Choice, rng: np.random.Generator) -> JointFindings:
+def _predictions(
+    log: JointLog, found: JointSearch | None, named: Container[str], rng: np.random.Generator
+) -> JointFindings:
     """Predictions by the named effects alone: beside others that the fit holds, they are fitted anew."""
-    sigma, values = choice.judge.sigma, {effect: choice.fit.values[effect] for effect in choice.named}
-    if values and len(values) < len(choice.fit.values):
-        values = fitter.fit(values, sigma).values
-    gain = cross_validation.held_out(fitter, values, sigma, rng)
-    return JointFindings(held_out=(gain,), residuals=(cross_validation.residuals(fitter.log, values),))
+    sigma = SMALLEST_NOISE if found is None else found.sigma
+    values = {} if found is None else {name: value for name, value in found.values.items() if name in named}
+    if found is not None and 0 < len(values) < len(found.values):
+        values = fit(log, values, sigma)
+    gain = cross_validation.held_out(log, values, sigma, rng)
+    return JointFindings(held_out=(gain,), residuals=(cross_validation.residuals(log, values),))
 
 
 def parts(found: JointFindings) -> tuple[Part, ...]:

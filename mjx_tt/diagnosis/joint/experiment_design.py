@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 from mjx_tt.diagnosis.joint.effects import BY_NAME, OBSERVATION_DELAY, members
 from mjx_tt.diagnosis.joint.findings import JointFindings, Undecided
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.selection import Choice
+from mjx_tt.diagnosis.joint.search import JointSearch
 
 
-def unseen(log: JointLog, choice: Choice, allowed: Sequence[str]) -> JointFindings:
+def unseen(log: JointLog, found: JointSearch | None, named: Container[str], allowed: Sequence[str]) -> JointFindings:
     """The allowed effects about which this log holds no evidence."""
     joint = log.record.joint
     why = "only the sum of action_delay and observation_delay shows in a log"
-    delays = (Undecided(f"{joint}.observation_delay", why),) if "action_delay" in choice.named else ()
-    quiet = [e for e in allowed if e not in choice.named and not _excited(log, choice, e)]
+    delays = (Undecided(f"{joint}.observation_delay", why),) if "action_delay" in named else ()
+    quiet = [e for e in allowed if e not in named and not _excited(log, found, e)]
     return JointFindings(
         not_identifiable=delays,
         not_excited=tuple(Undecided(f"{joint}.{m}", _why(log, e)) for e in quiet for m in members(e)),
@@ -23,13 +23,13 @@ def unseen(log: JointLog, choice: Choice, allowed: Sequence[str]) -> JointFindin
     )
 
 
-def _excited(log: JointLog, choice: Choice, name: str) -> bool:
+def _excited(log: JointLog, found: JointSearch | None, name: str) -> bool:
     """True if the effect at the smallest size of interest would have been seen."""
-    if log.fastest == 0.0:
+    if found is None:
         return False
     value = BY_NAME[name].interest(log, log.base[name])
-    change = log.simulate({**choice.fit.values, name: value}) - log.simulate(choice.fit.values)
-    return choice.judge.visible(log.centred(change))
+    change = log.simulate({**found.values, name: value}) - log.simulate(found.values)
+    return found.visible(log, log.centred(change))
 
 
 def _why(log: JointLog, name: str) -> str:

@@ -238,7 +238,8 @@ class _Path:
         at = np.flatnonzero(velocity[:-1] * velocity[1:] < 0.0)
         low, high, below, above = times[at], times[at + 1], velocity[at], velocity[at + 1]
         for _ in range(3):  # false position, which the curve's end that stays would hold up
-            root = low + (high - low) * below / (below - above)
+            apart = below - above
+            root = low + (high - low) * below / np.where(apart == 0.0, 1.0, apart)
             here = self._velocity(root)
             first = here * below > 0.0
             low, below, above = (

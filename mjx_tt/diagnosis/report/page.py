@@ -19,9 +19,9 @@ from markupsafe import Markup
 
 from mjx_tt.diagnosis.ball.diagnose import FLOOR
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
-from mjx_tt.diagnosis.ball.search import LEAST_SHARE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
+from mjx_tt.diagnosis.inclusion import LEAST_SHARE
 from mjx_tt.diagnosis.report import cleaning, figures, headline, residuals, spins, text
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
@@ -221,14 +221,14 @@ def _sets(d: Diagnosis, page: Page) -> Context:
     if d.balls is None:
         return None
     search, effects = d.balls.search, d.balls.problem.effects
-    best = max(search.evidence)
+    best = max(search.picked.evidence)
     rows = [
         (
             Markup(" + ").join(_code(effects[j].name) for j in s) or "nothing",
             f"{best - evidence:.1f}",
             "chosen" if set(s) == set(search.chosen) else "",
         )
-        for s, evidence in zip(search.path, search.evidence, strict=True)
+        for s, evidence in zip(search.picked.path, search.picked.evidence, strict=True)
     ]
     return {"rows": rows, "least": f"{100 * LEAST_SHARE:.0f} %"}
 

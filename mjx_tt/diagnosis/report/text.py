@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjx_tt.diagnosis.ball import effects as ball_effects
-from mjx_tt.diagnosis.ball import inclusion
 from mjx_tt.diagnosis.ball.diagnose import FLOOR, BallFindings
-from mjx_tt.diagnosis.ball.search import LEAST_EVIDENCE
 from mjx_tt.diagnosis.description import Description, Way
 from mjx_tt.diagnosis.diagnose import Diagnosis
+from mjx_tt.diagnosis.inclusion import LEAST_EVIDENCE, PRICE
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained, Verdict
 
@@ -142,7 +141,7 @@ def detectable(found: BallFindings) -> dict[str, float]:
             out[effect.name] = math.inf
             continue
         error = math.sqrt(search.model.solve((*search.chosen, j))[1][j, j])
-        price = 2.0 * (inclusion.PRICE + LEAST_EVIDENCE) + 2.0 * math.log(max(search.model.scale[j] / error, 1.0))
+        price = 2.0 * (PRICE + LEAST_EVIDENCE) + 2.0 * math.log(max(search.model.scale[j] / error, 1.0))
         out[effect.name] = 1e3 * error * math.sqrt(price) * float(search.shift[j])
     return out
 

@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_tt.diagnosis.joint.coupling import coupling
-from mjx_tt.diagnosis.joint.fit import Fitter
+from mjx_tt.diagnosis.joint.fit import residual, scale, slopes, weights
 from mjx_tt.diagnosis.joint.forward_model import JointResponse, Motion, nominal_response
 from mjx_tt.diagnosis.joint.log import JointLog, JointRecord
-from mjx_tt.diagnosis.joint.scores import scale, weights
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Samples
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
@@ -96,16 +95,15 @@ def _bus(
         for k, log in enumerate(logs):
             mine = [2 * k, 2 * k + 1, len(values) - 1]
             at = dict(zip(FITTED, values[mine].tolist(), strict=True))
-            fitter = Fitter(log)
             sigma = scale(log.centred(log.measured - log.simulate(at)))
-            residual = fitter.residual(at, sigma)
-            sigma = left[k] = scale(residual)
-            weight = weights(residual, sigma)
-            slopes = log.centred(fitter.jacobian(at), weight)
+            rest = residual(log, at, sigma)
+            sigma = left[k] = scale(rest)
+            weight = weights(rest, sigma)
+            columns = log.centred(slopes(log, at), weight)
             place = np.ix_(mine, mine)
-            gram[place] += slopes.T @ (slopes * weight[:, None]) / sigma**2
-            right[mine] += slopes.T @ (weight * residual) / sigma**2
-            scores = np.add.reduceat(slopes * (weight * residual)[:, None], log.starts, axis=0) / sigma**2
+            gram[place] += columns.T @ (columns * weight[:, None]) / sigma**2
+            right[mine] += columns.T @ (weight * rest) / sigma**2
+            scores = np.add.reduceat(columns * (weight * rest)[:, None], log.starts, axis=0) / sigma**2
             spread[place] += scores.T @ scores
         inverse = np.linalg.inv(gram)
         covariance = inverse @ spread @ inverse

@@ -13,12 +13,13 @@ from scipy.stats import multivariate_normal
 from ballmodel.io import read
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis
-from mjx_tt.diagnosis.ball import discrepancy, inclusion
+from mjx_tt.diagnosis import inclusion
+from mjx_tt.diagnosis.ball import discrepancy
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
-from mjx_tt.diagnosis.ball.inclusion import Family, LinearModel
+from mjx_tt.diagnosis.inclusion import Family, LinearModel
 from mjx_tt.prediction.benchmark import benchmark
 from mjx_tt.sim import model
 from mjx_tt.sim.model import SimModel

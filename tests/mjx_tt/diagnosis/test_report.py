@@ -145,7 +145,7 @@ def test_smallest_visible_effect_falls_with_more_balls(windy):
     all_of_them = words.detectable(windy.balls)
     assert set(all_of_them) >= {"table_friction", "wind_y", "camera_scale"} and "wind_x" not in all_of_them
     search = windy.balls.search
-    half = replace(search, model=search.model.of_balls(np.arange(0, windy.balls.problem.grid.n, 2)))
+    half = replace(search, model=search.model.of_pieces(np.arange(0, windy.balls.problem.grid.n, 2)))
     fewer = words.detectable(replace(windy.balls, search=half))
     ratio = [fewer[n] / all_of_them[n] for n in all_of_them if math.isfinite(all_of_them[n] + fewer[n])]
     assert 1.2 < np.median(ratio) < 1.7

@@ -1,19 +1,20 @@
-"""Which causes are in the model: one linear Gaussian model of all flights, and the evidence of every set of causes.
+"""Which causes are in the model: a linear Gaussian model of all logged pieces, and the evidence of every set of causes.
 
-At the best fit so far the flights are linear in what is unknown. Every effect of the catalogue is somewhat off: the
-chosen ones by ordinary amounts (the catalogue's ``scale``), the others by as much as nobody would name (spike and slab:
-George and McCulloch, J. Am. Stat. Assoc. 88, 1993). Beside them smooth functions stand for what no effect explains (the
-discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001), orthogonal to the chosen effects, so that it takes
-nothing from their sizes (Plumlee, J. Am. Stat. Assoc. 112, 2017). Each family of functions has an amplitude, which the
-evidence decides (MacKay, Neural Computation 4, 1992): one that is not needed goes to zero.
+A piece is a ball's flight or a window of a joint's log. At the best fit so far pieces are linear in what is unknown.
+Every effect of the catalogue is somewhat off: the chosen ones by ordinary amounts (the catalogue's ``scale``), the
+others by as much as nobody would name (spike and slab: George and McCulloch, J. Am. Stat. Assoc. 88, 1993). Beside
+them smooth functions stand for what no effect explains (the discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B 63,
+2001), orthogonal to the chosen effects, so that it takes nothing from their sizes (Plumlee, J. Am. Stat. Assoc. 112,
+2017). Each family of functions has an amplitude, which the evidence decides (MacKay, Neural Computation 4, 1992): one
+that is not needed goes to zero.
 
-Real noise is not quite the model's: the evidence is divided by how much more the flights' scores scatter from ball to
-ball than it says.
+Real noise is not quite the model's: the evidence is divided by how much more the pieces' scores scatter than it says.
+Evidence proposes causes; each is worth its name by the share of the error that it takes away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -29,6 +30,16 @@ PRICE = 3.0  # of the logarithm of the evidence, that a cause must bring: one in
 PRICE_OF_FAMILY = 6.0  # the same of a discrepancy
 FARTHEST = 4.0  # ordinary sizes beyond which a cause is none
 EXHAUSTIVE = 3  # causes up to which every set is tried
+MOST_CAUSES = 5
+LEAST_EVIDENCE = 2.0  # of the logarithm, that each cause must bring beside the best discrepancy
+LEAST_SHARE = 0.01  # of the error, that a cause must take away
+LEAST_LEFT_SHARE = 0.2  # of the error, from which on what no cause explains is "unexplained"
+LEADING_SHARE = 0.9  # of the error, beyond which a cause is named though a smooth function could stand for it
+HALF = 0.5  # of all that the evidence gains, by which a single cause is looked at
+HALVES = 20  # of the pieces, by which a cause's confidence is told
+WIDE = 10.0  # times ordinary sizes, where only the data are to speak
+ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
+TIE = 5.0  # of the logarithm of the evidence by which a cause must beat another in its place
 
 
 @dataclass(frozen=True)
@@ -53,10 +64,10 @@ class Left:
 
 @dataclass(frozen=True)
 class LinearModel:
-    """Flights about a fit: information about columns, effects first, then the families' functions."""
+    """Pieces about a fit: information about columns, effects first, then the families' functions."""
 
-    ball_gram: Float[np.ndarray, "n c c"]
-    ball_right: Float[np.ndarray, "n c"]
+    piece_gram: Float[np.ndarray, "n c c"]
+    piece_right: Float[np.ndarray, "n c"]
     middle: Float[np.ndarray, " K"]  # of the effects' priors
     scale: Float[np.ndarray, " K"]  # of an effect in the set
     spike: Float[np.ndarray, " K"]  # of one that is not
@@ -73,14 +84,22 @@ class LinearModel:
 
     @cached_property
     def total(self) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Information of all balls, and its right side about the priors' middles."""
-        gram, right = self.ball_gram.sum(axis=0), self.ball_right.sum(axis=0)
+        """Information of all pieces, and its right side about the priors' middles."""
+        gram, right = self.piece_gram.sum(axis=0), self.piece_right.sum(axis=0)
         right = right - gram[:, : self.effects] @ self.middle
         return gram / self.temper, right / self.temper
 
-    def of_balls(self, which: Int[np.ndarray, " m"]) -> LinearModel:
-        """The model of some of the balls."""
-        return replace(self, ball_gram=self.ball_gram[which], ball_right=self.ball_right[which])
+    def of_pieces(self, which: Int[np.ndarray, " m"]) -> LinearModel:
+        """The model of some of the pieces."""
+        return replace(self, piece_gram=self.piece_gram[which], piece_right=self.piece_right[which])
+
+    def tempered(self) -> tuple[LinearModel, Left]:
+        """The model, its evidence divided by how much more the scores scatter than it says; and all it explains."""
+        k, everything = self.effects, self.beside(self.candidates)
+        score = self.piece_right[:, :k] - np.einsum("nkl,l->nk", self.piece_gram[:, :k], everything.coefficients)
+        ratio = (score**2).sum(axis=0) / np.maximum(np.diagonal(self.piece_gram.sum(axis=0))[:k], 1e-300)
+        typical = float(np.median(ratio[list(self.candidates)])) if self.candidates else 1.0
+        return replace(self, temper=max(typical, 1.0)), everything
 
     def precision(self, chosen: Sequence[int]) -> Float[np.ndarray, " K"]:
         """Of the effects' priors."""
@@ -130,6 +149,34 @@ class LinearModel:
                 tried = list(dict.fromkeys([*more, *swapped]))
             path.append(tried[int(np.argmax(self.evidence(tried)))])
         return path
+
+    def group(self, chosen: Set, member: int) -> Set:
+        """A chosen effect, and those that explain as much in its place, or nearly in the same way."""
+        rest = tuple(c for c in chosen if c != member)
+        others = [c for c in self.candidates if c not in chosen]
+        wide = replace(self, scale=WIDE * self.scale)
+        evidence = wide.evidence([chosen, *((*rest, c) for c in others)])
+        gram, beside = self.total[0], [*rest, *self.always]
+        pair = [member, *others]
+        alone = gram[np.ix_(pair, pair)]
+        if beside:
+            mixed = gram[np.ix_(pair, beside)]
+            alone = alone - mixed @ np.linalg.solve(gram[np.ix_(beside, beside)], mixed.T)
+        cosine = np.abs(alone[0]) / np.sqrt(np.maximum(alone[0, 0] * np.diagonal(alone), 1e-300))
+        same = (evidence[0] - evidence[1:] < TIE) | (cosine[1:] > ALIKE)
+        return (member, *(c for c, alike in zip(others, same, strict=True) if alike))
+
+    def confidence(self, chosen: Set, rng: np.random.Generator) -> dict[int, float]:
+        """Share of random halves of the pieces whose likeliest set holds each of the chosen, or one of its group."""
+        groups, n = {j: set(self.group(chosen, j)) for j in chosen}, len(self.piece_gram)
+        share = dict.fromkeys(chosen, 0)
+        for _ in range(HALVES if share else 0):
+            half = self.of_pieces(rng.permutation(n)[: n // 2])
+            path = half.best(len(chosen))
+            likeliest = set(path[int(np.argmax(half.evidence(path)))])
+            for j in share:
+                share[j] += bool(groups[j] & likeliest)
+        return {j: count / HALVES for j, count in share.items()}
 
     def beside(self, chosen: Set, prune: bool = True) -> Left:
         """Discrepancy beside a set of causes, with the amplitudes that make the flights the likeliest."""
@@ -189,6 +236,55 @@ class LinearModel:
         out[inside] = share[:, -1] - share[:, :-1] @ mean
         out[: self.effects] += self.middle
         return Left(out, logarithm - price, explained + float(inner_right @ mean))
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The causes that were chosen; errors are mean squares, as ``choose`` was told them."""
+
+    causes: Set
+    path: Sequence[Set]  # the likeliest set of each number of causes
+    evidence: Sequence[float]  # theirs, beside the best discrepancy
+    left: Left  # beside the chosen
+    errors: Float[np.ndarray, " e"]  # of the nominal model
+    remaining: Float[np.ndarray, " e"]  # beside the chosen
+    without: dict[int, Float[np.ndarray, " e"]]  # with each of the chosen left out
+
+
+def choose(
+    model: LinearModel,
+    errors_of: Callable[[Set], Float[np.ndarray, " e"]],
+    before: Set,
+    nominal: float,
+    level: float,
+    nothing: float,
+    early: bool,
+) -> Chosen:
+    """The likeliest set, as long as each of its causes takes away LEAST_SHARE of an error.
+
+    A set that was chosen before stays unless another is clearly better. early: sizes do not count yet.
+    errors_of: mean squares beside a set; nominal: of the nominal model; level: of the noise; nothing: too small to
+    divide by.
+    """
+    path = model.best(MOST_CAUSES)
+    beside = [model.beside(s) for s in path]
+    evidence = np.array([b.evidence for b in beside])
+    held = np.array([LEAST_EVIDENCE if set(s) == set(before) else 0.0 for s in path])
+    count = int(np.argmax(evidence + held - LEAST_EVIDENCE * np.arange(len(path))))
+    alone = model.evidence(path[:2])
+    if early and count == 0 and alone[-1] - alone[0] > HALF * (evidence[0] - alone[0]):
+        count = 1  # to be looked at from there: what is far off is not told from here
+    errors = [errors_of(s) for s in path[: max(count, 1) + 1]]
+    whole = np.maximum(errors[0], nominal) - level
+    gained = [float(np.max((a - b) / np.maximum(whole, nothing))) for a, b in zip(errors, errors[1:], strict=False)]
+    while not early and count and gained[count - 1] < LEAST_SHARE:
+        count -= 1
+    if count == 0 and gained and gained[0] > LEADING_SHARE:
+        count = 1
+    causes = path[count]
+    without = {j: errors_of(tuple(c for c in causes if c != j)) for j in causes}
+    largest = np.maximum(errors[0], nominal)
+    return Chosen(causes, path, evidence.tolist(), beside[count], largest, errors[count], without)
 
 
 def _inverse(full: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
