@@ -289,6 +289,8 @@ def choose(
 
 def _inverse(full: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
     """Of a symmetric matrix whose columns have very different units."""
+    if not len(full):
+        return full
     size = 1.0 / np.sqrt(np.diagonal(full))
     root, failed = dpotrf(full * size[:, None] * size + 1e-9 * np.eye(len(full)), lower=True)
     if failed:

@@ -39,7 +39,7 @@ class Cause:
     parameters: dict[str, Estimate]  # by dotted path of SimModel, of a joint by joint.parameter
     effect_mm: float  # median shift of a flight's last sample; rms movement of a joint [mrad], an axis [mm]
     separating_measurement: str
-    share: float = 0.0  # of the nominal model's error that it takes away; 0 for joints and hits
+    share: float = 0.0  # of the nominal model's error that it takes away; 0 for hits
 
 
 @dataclass(frozen=True)

@@ -185,8 +185,8 @@ def _part_of(joint: str, found: JointFindings, left: JointFinding | None) -> Par
     named = tuple(Expressed(c, _drive_values(c)) for c in found.causes if c.name.partition(".")[0] == joint)
     if left is None:
         return Part(named)
-    size = f"{left.size:.2f} mrad or mm"
-    return Part(named, unexplained=Unexplained(f"{left.joint}: {left.block}", left.where, left.direction, size))
+    open_ = Unexplained(f"{joint}: {left.block}", left.where, left.direction, f"{left.size:.2f} mrad or mm")
+    return Part(named, unexplained=open_, adopted=any(g.low > 0.0 for g in found.held_out if g.joint == joint))
 
 
 def _drive_values(cause: Cause) -> dict[str, float]:

@@ -1,7 +1,8 @@
 """Logs of the joints: velocity commands and measured positions, read, checked and made ready for fits.
 
 A log is a pair of CSV files: ``command.csv`` with columns t, joint, velocity and ``state.csv`` with columns t, joint,
-position; joints by name, SI units, rows of different joints in any mixture, each joint's own rows in order of time.
+position; joints by name, SI units, rows of different joints in any mixture, each joint's own rows in order of time. A
+value that is nan was not reported.
 """
 
 from __future__ import annotations
@@ -159,8 +160,10 @@ def _read(path: Path, value: str, joints: tuple[str, ...]) -> dict[str, tuple[np
                     raise ValueError(f"{path}:{reader.line_num}: no joint {joint!r}; joints are {', '.join(joints)}")
                 times, values = rows.setdefault(joint, ([], []))
                 try:
-                    times.append(float(row[time_at]))
-                    values.append(float(row[value_at]))
+                    at, value_then = float(row[time_at]), float(row[value_at])
+                    if not math.isnan(value_then):  # a joint that has not reported yet
+                        times.append(at)
+                        values.append(value_then)
                 except ValueError as error:
                     raise ValueError(f"{path}:{reader.line_num}: t and {value} must be numbers, {error}") from None
         except (csv.Error, UnicodeDecodeError) as error:
