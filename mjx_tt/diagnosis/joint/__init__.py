@@ -2,12 +2,10 @@
 
 One joint at a time. A candidate model is the nominal response with a few effects changed; its parameters are fitted
 with a free offset in every window of the log, so that neither the unknown start nor a slow drift of the integrated
-velocity speaks for an effect. An effect is named when dropping it costs far more than the noise, as correlated as it
-is, could explain, and when it moves the joint by more than a floor. What the catalogue leaves over is held against
-functions that carry no name; when one of them explains it, the answer is "unexplained", and names that it could replace
-are dropped.
-
-The constants were set on logs of another simulator, 60 s a joint; tests/mjx_tt/diagnosis/test_joint.py has it.
+velocity speaks for an effect. Effects are chosen as those of the balls are (``mjx_tt.diagnosis.inclusion``): by their
+evidence beside functions that carry no name, and by the share of the joint's error that each takes away. An effect is
+named when most halves of the log show it and it moves the joint by more than a floor. A joint is "unexplained" when a
+fifth of its error is left.
 """
 
 from __future__ import annotations

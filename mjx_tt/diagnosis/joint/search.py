@@ -7,8 +7,9 @@ its change: from the nominal value to the fitted one, or to the best of the valu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -52,9 +53,8 @@ class JointSearch:
 
     @property
     def left(self) -> float:
-        """Size [rad], [m] rms of all discrepancy."""
-        k = self.model.effects
-        return rms(self.columns[:, k:] @ self.picked.left.coefficients[k:])
+        """Size [rad], [m] rms of what the chosen leave, without the noise."""
+        return math.sqrt(max(float(self.picked.remaining[0]) - self.level, 0.0))
 
     def share(self, name: str) -> float:
         """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
@@ -82,17 +82,32 @@ def search(log: JointLog, names: Sequence[str]) -> JointSearch:
         now = np.array([float(name in values) for name in names] + [0.0] * smooth.shape[1])
         # What is not explained yet is smooth and would pass for noise: the noise is what all together leaves.
         for _ in range(1 if round_ else 2):
-            model, everything = _linear_model(log, names, columns, now, r, sigma, families, starts).tempered()
+            model, everything = _linear_model(log, names, columns, now, r, sigma, families).tempered()
             left = r - columns @ (everything.coefficients - now)
             sigma = scale(left)
         level = _mean_square(left)
         fits.prepare(model, values, starts, sigma)
         picked = choose(model, fits.errors, before, 0.0, level, NOTHING, round_ < EARLY)
+        picked = _best_of_alike(model, picked, fits)
         values = fits.of(picked.causes)
         if picked.causes == before and round_ >= EARLY:
             break
         before = picked.causes
     return JointSearch(tuple(names), values, model, picked, columns, sigma, level)
+
+
+def _best_of_alike(model: LinearModel, picked: Chosen, fits: _Fits) -> Chosen:
+    """Of effects that look alike the one that leaves least: a whole change is not told from another by slopes."""
+    for member in picked.causes:
+        rest = tuple(c for c in picked.causes if c != member)
+        for rival in model.group(picked.causes, member)[1:]:
+            causes = tuple(sorted((*rest, rival)))
+            remaining = fits.errors(causes)
+            if remaining < picked.remaining:
+                without = {c: fits.errors(tuple(o for o in causes if o != c)) for c in causes}
+                left = model.beside(causes)
+                return replace(picked, causes=causes, left=left, remaining=remaining, without=without)
+    return picked
 
 
 def _changes(
@@ -129,7 +144,6 @@ def _linear_model(
     r: Float[np.ndarray, " n"],
     sigma: float,
     families: tuple[Family, ...],
-    starts: dict[str, float],
 ) -> LinearModel:
     """The linear model; windows are its pieces. now: the sizes at which r is what is left."""
     weight = weights(r, sigma) / sigma**2
@@ -140,9 +154,6 @@ def _linear_model(
     right = np.array([weighted[p].T @ r[p] for p in pieces]) + gram @ now
     size = np.sqrt(np.mean(columns[:, : len(names)] ** 2, axis=0))
     spike = SPIKE / np.maximum(size, 1e-9)
-    for k, name in enumerate(names):  # what is too small to be named must not be named as something else
-        if BY_NAME[name].smallest and name in starts:
-            spike[k] = max(spike[k], BY_NAME[name].smallest / max(abs(starts[name] - log.base[name]), 1e-9))
     seen = tuple(k for k in range(len(names)) if gram[:, k, k].sum() > 1.0)
     count = len(names)
     return LinearModel(
