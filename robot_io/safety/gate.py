@@ -34,6 +34,7 @@ SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
+FAST = 0.25  # share of a joint's highest speed above which the others are proven clear of its blocking
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
 LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
@@ -451,10 +452,7 @@ class SafetyGate:
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             if self.geometry.first_too_close(ways + self._deviation[:, None], self._touch, SLACK) is not None:
                 return False
-        low, high = self._monitor.reach
-        gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
-        stuck = blocked(gone[:, ::-STRIDE], np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1)))
-        if self.geometry.first_too_close(stuck, self._touch, SLACK) is not None:
+        if (np.abs(velocity) > FAST * self._v_max).any() and not self._clear_of_blocked(way):
             return False
         beside = self._monitor.beside
         if beside.size and not all(self.geometry.clear_beside(each, beside, self._touch) for each in (way, late)):
@@ -466,6 +464,13 @@ class SafetyGate:
             gaps = self.geometry.gaps(way)[self._inside]
             return bool((gaps[:, -1] > gaps[:, 0]).all())
         return True
+
+    def _clear_of_blocked(self, way: np.ndarray) -> bool:
+        """True when no joint that blocks before or on a way leads the others into anything, while nobody can know."""
+        low, high = self._monitor.reach
+        gone = np.concatenate([self._monitor.past(self._last or 0.0, self.config.delay)[1], way], axis=1)
+        stuck = blocked(gone[:, ::-STRIDE], np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1)))
+        return self.geometry.first_too_close(stuck, self._touch, SLACK) is None
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""
