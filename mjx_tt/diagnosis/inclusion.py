@@ -1,8 +1,8 @@
 """Which causes are in the model: a linear Gaussian model of all logged pieces, and the evidence of every set of causes.
 
-A piece is a ball's flight or a window of a joint's log. At the best fit so far pieces are linear in what is unknown.
-Every effect of the catalogue is somewhat off: the chosen ones by ordinary amounts (the catalogue's ``scale``), the
-others by as much as nobody would name (spike and slab: George and McCulloch, J. Am. Stat. Assoc. 88, 1993). Beside
+A piece is a ball's flight, a hit or a window of a joint's log. At the best fit so far pieces are linear in what is
+unknown. Every effect of the catalogue is somewhat off: the chosen ones by ordinary amounts (the catalogue's ``scale``),
+the others by as much as nobody would name (spike and slab: George and McCulloch, J. Am. Stat. Assoc. 88, 1993). Beside
 them smooth functions stand for what no effect explains (the discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B 63,
 2001), orthogonal to the chosen effects, so that it takes nothing from their sizes (Plumlee, J. Am. Stat. Assoc. 112,
 2017). Each family of functions has an amplitude, which the evidence decides (MacKay, Neural Computation 4, 1992): one
@@ -249,6 +249,11 @@ class Chosen:
     errors: Float[np.ndarray, " e"]  # of the nominal model
     remaining: Float[np.ndarray, " e"]  # beside the chosen
     without: dict[int, Float[np.ndarray, " e"]]  # with each of the chosen left out
+
+    def share(self, member: int, level: float, nothing: float) -> float:
+        """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
+        gone = (self.without[member] - self.remaining) / np.maximum(self.errors - level, nothing)
+        return float(np.max(gone))
 
 
 def choose(

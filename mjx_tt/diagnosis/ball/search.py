@@ -22,6 +22,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem,
 from mjx_tt.diagnosis.ball.flights.noise import Noise, Whitening
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 from mjx_tt.diagnosis.inclusion import Chosen, Family, Left, LinearModel, Set, choose
+from mjx_tt.diagnosis.robust import bounded_mean
 
 ROUNDS = 8
 EARLY = 2  # of them, in which no cause has to be worth its name
@@ -65,8 +66,7 @@ class Search:
 
     def share(self, member: int) -> float:
         """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
-        p = self.picked
-        return float(np.max((p.without[member] - p.remaining) / np.maximum(p.errors - self.level, NO_ERROR)))
+        return self.picked.share(member, self.level, NO_ERROR)
 
 
 def search(
@@ -292,5 +292,4 @@ class Sizes:
 def mean_square(left: Float[np.ndarray, "3 T n"], g: Grid, unknowns: int) -> float:
     """Mean square [m^2] of the samples' distances, outliers bounded, after a fit of so many numbers to each ball."""
     square, samples = (left**2).sum(axis=0)[g.mask], int(g.mask.sum())
-    bounded = np.minimum(square, noise.OUTLIER * np.median(square)).mean()
-    return float(bounded * samples / max(samples - unknowns * g.n / 3.0, 0.2 * samples))
+    return float(bounded_mean(square) * samples / max(samples - unknowns * g.n / 3.0, 0.2 * samples))

@@ -107,15 +107,17 @@ def _of_joint(log: JointLog, gone: set[str], home: float | None, rng: np.random.
 
 
 def _named(log: JointLog, found: JointSearch, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
-    """Of the chosen effects those of a size that matters and that most halves of the log show: each one's movement
-    [rad], [m] rms, and its confidence."""
+    """Of the chosen effects those of a size that matters, that most halves of the log show, and that explain more than
+    all leave, for which they could stand: each one's movement [rad], [m] rms, and its confidence."""
     confidence = found.model.confidence(found.picked.causes, rng)
     moved = {}
     for name, value in found.values.items():
         rest = {n: v for n, v in found.values.items() if n != name}
         movement = rms(log.centred(log.simulate(found.values) - log.simulate(rest)))
         sure = confidence[found.names.index(name)]
-        if sure > SURE and movement >= FLOOR and abs(value - log.base[name]) >= BY_NAME[name].smallest:
+        if sure <= SURE or found.share(name) <= found.left_share:
+            continue
+        if movement >= FLOOR and abs(value - log.base[name]) >= BY_NAME[name].smallest:
             moved[name] = movement, sure
     return moved
 
@@ -141,10 +143,9 @@ def _causes(log: JointLog, found: JointSearch, named: Mapping[str, tuple[float, 
             )
         )
         experiments += [measurement] if rivals else []
-    left, whole = found.left, max(float(found.picked.errors[0]) - found.level, found.left**2)
     open_: tuple[JointFinding, ...] = ()
-    if left > FLOOR and left**2 > LEAST_LEFT_SHARE * whole:
-        open_ = (JointFinding(joint, *found.pattern, 1e3 * left),)
+    if found.left > FLOOR and found.left_share > LEAST_LEFT_SHARE:
+        open_ = (JointFinding(joint, *found.pattern, 1e3 * found.left),)
     return JointFindings(causes=tuple(causes), next_experiment=tuple(experiments), unexplained_by_joint=open_)
 
 

@@ -70,7 +70,7 @@ def fit(log: JointLog, start: Values, sigma: float, mask: Float[np.ndarray, " n"
 
     found = least_squares(
         lambda x: mask * residual(log, named(x), sigma) / sigma,
-        np.clip(list(values.values()), *(limits + [[1e-9, -1e-9]] * size[:, None]).T) / size,
+        np.clip(list(values.values()), *limits.T) / size,
         lambda x: -np.broadcast_to(mask, log.time.shape)[:, None] * log.centred(slopes(log, named(x))) * size / sigma,
         tuple(limits.T / size),
         loss="huber",

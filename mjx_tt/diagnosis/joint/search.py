@@ -19,11 +19,10 @@ from mjx_tt.diagnosis.joint import discrepancy
 from mjx_tt.diagnosis.joint.effects import BY_NAME
 from mjx_tt.diagnosis.joint.fit import HUBER, fit, residual, rms, scale, slopes, weights
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.robust import huber_loss
+from mjx_tt.diagnosis.robust import bounded_mean, huber_loss
 
 ROUNDS, EARLY = 8, 2  # early: no cause has to be worth its name
 SPIKE = 1e-4  # [rad], [m] rms by which what is not chosen may move the joint
-OUTLIER = 25.0  # times the median square, beyond which a residual's square counts no more
 FLOOR = 5e-4  # [rad], [m] rms movement below which nothing is named
 VISIBLE, ONE_WINDOW = 30.0, 12.0  # squared noise deviations that a change must make, in all and without one window
 NOTHING = 1e-9  # [rad^2], [m^2] beside the noise, below which there is no error
@@ -38,15 +37,19 @@ class JointSearch:
     model: LinearModel
     picked: Chosen
     columns: Float[np.ndarray, "n c"]  # of the model
+    residual: Float[np.ndarray, " n"]  # beside the chosen
     sigma: float  # deviation of the noise
     level: float  # its mean square
 
     @property
     def pattern(self) -> tuple[str, str, str]:
-        """The discrepancy that moves the joint most: its name, where it is largest, and in which direction."""
-        of = self.picked.left.coefficients
-        family = max(self.model.families, key=lambda f: rms(self.columns[:, f.columns] @ of[f.columns]))
-        shape = of[family.columns]
+        """The discrepancy that alone explains most of what is left: its name, where it is largest, its direction."""
+        explained = []
+        for family in self.model.families:
+            columns = self.columns[:, family.columns]
+            shape = np.linalg.lstsq(columns, self.residual, 1e-6)[0]
+            explained.append((float(self.residual @ columns @ shape), family, shape))
+        _, family, shape = max(explained, key=lambda row: row[0])
         shape = shape - shape.mean() if shape.size > 1 else shape
         largest = int(np.argmax(np.abs(shape)))
         return family.name, family.labels[largest], "+" if shape[largest] > 0.0 else "-"
@@ -56,10 +59,14 @@ class JointSearch:
         """Size [rad], [m] rms of what the chosen leave, without the noise."""
         return math.sqrt(max(float(self.picked.remaining[0]) - self.level, 0.0))
 
+    @property
+    def left_share(self) -> float:
+        """Part of the nominal model's error, the noise left out, that the chosen leave."""
+        return self.left**2 / max(float(self.picked.errors[0]) - self.level, self.left**2, NOTHING)
+
     def share(self, name: str) -> float:
         """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
-        p, member = self.picked, self.names.index(name)
-        return float((p.without[member] - p.remaining)[0] / max(p.errors[0] - self.level, NOTHING))
+        return self.picked.share(self.names.index(name), self.level, NOTHING)
 
     def visible(self, log: JointLog, change: Float[np.ndarray, " n"]) -> bool:
         """True if a change of the predicted positions would show in this noise."""
@@ -85,7 +92,7 @@ def search(log: JointLog, names: Sequence[str]) -> JointSearch:
             model, everything = _linear_model(log, names, columns, now, r, sigma, families).tempered()
             left = r - columns @ (everything.coefficients - now)
             sigma = scale(left)
-        level = _mean_square(left)
+        level = bounded_mean(left**2)
         fits.prepare(model, values, starts, sigma)
         picked = choose(model, fits.errors, before, 0.0, level, NOTHING, round_ < EARLY)
         picked = _best_of_alike(model, picked, fits)
@@ -93,7 +100,7 @@ def search(log: JointLog, names: Sequence[str]) -> JointSearch:
         if picked.causes == before and round_ >= EARLY:
             break
         before = picked.causes
-    return JointSearch(tuple(names), values, model, picked, columns, sigma, level)
+    return JointSearch(tuple(names), values, model, picked, columns, residual(log, values, sigma), sigma, level)
 
 
 def _best_of_alike(model: LinearModel, picked: Chosen, fits: _Fits) -> Chosen:
@@ -185,7 +192,7 @@ class _Fits:
 
     def errors(self, chosen: Set) -> Float[np.ndarray, 1]:
         """Mean square beside a set."""
-        return np.array([_mean_square(residual(self._log, self.of(chosen), self._sigma))])
+        return np.array([bounded_mean(residual(self._log, self.of(chosen), self._sigma) ** 2)])
 
     def _begin(self, chosen: Set) -> dict[str, float]:
         size = self._model.solve(chosen)[0]
@@ -199,8 +206,3 @@ class _Fits:
 
     def _cost(self, values: dict[str, float]) -> float:
         return float(np.sum(huber_loss(np.abs(residual(self._log, values, self._sigma)) / self._sigma, HUBER)))
-
-
-def _mean_square(r: Float[np.ndarray, " n"]) -> float:
-    square = r * r
-    return float(np.minimum(square, OUTLIER * np.median(square)).mean())

@@ -10,6 +10,7 @@ import pytest
 from mjx_tt.diagnosis.joint import (
     JointFinding,
     JointFindings,
+    JointGain,
     JointRecord,
     JointResponse,
     diagnose_joints,
@@ -103,9 +104,10 @@ def test_names_nothing_when_the_model_is_right(seed):
     assert findings.held_out[0].before == findings.held_out[0].after
 
 
-def test_calls_an_effect_outside_the_catalogue_unexplained():
+@pytest.mark.parametrize("seed", range(3))
+def test_calls_an_effect_outside_the_catalogue_unexplained(seed):
     """A drive that loses some of its way in one direction only."""
-    log = record()
+    log = record(seed=seed)
     lost = 0.06 * np.cumsum(np.maximum(np.diff(log.state_position, prepend=0.0), 0.0))
     findings = diagnose(replace(log, state_position=log.state_position - lost))
     assert findings.causes == ()
@@ -149,7 +151,7 @@ def test_reads_a_pair_of_files_and_names_what_is_wrong(tmp_path):
         files[1].write_text("\n".join(["t,joint,position", *lines]))
         return read_robot_csv(*files)
 
-    (found,) = read(states)
+    (found,) = read([f"{float(log.state_time[0]) - 0.01!r},joint_2,nan", *states])  # it had not reported yet
     np.testing.assert_array_equal(found.state_position, log.state_position)
     np.testing.assert_array_equal(found.command_time, log.command_time)
     for bad, message in (
@@ -173,3 +175,8 @@ def test_a_joint_that_stays_open_takes_no_others_cause_with_it():
     assert verdict.verdict == "unexplained" and values == {"drives.joint_2.lag": 0.02}
     assert {c.name for c in verdict.causes} == {"joint_2.lag", "joint_3.lag"}
     assert verdict.unexplained.block.startswith("joint_3") and NOT_ADOPTED in verdict.warnings
+    better = JointGain("joint_3", before=2e-3, after=1e-3, low=5e-4, high=1.5e-3)
+    assert combined(parts(replace(found, held_out=(better,))))[1] == {
+        "drives.joint_2.lag": 0.02,
+        "drives.joint_3.lag": 0.01,
+    }

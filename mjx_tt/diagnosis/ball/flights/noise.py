@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.robust import GAUSSIAN, huber_weights
+from mjx_tt.diagnosis.robust import GAUSSIAN, OUTLIER, huber_weights
 
 HUBER = 3.0  # whitened distance beyond which a sample counts linearly; a Gaussian's is beyond it in 3 % of cases
 JITTER_Z = 4.5  # standard errors of a jitter of the time stamps
-OUTLIER = 30.0  # times the median square beyond which a sample counts no more: a Gaussian's never is
 LEAST_SHARE = 0.7  # of the noise along the flight beyond that across it which must grow with the speed's square
 NOMINAL_SCALE = 0.003  # [m] before anything is known
 LARGEST_MEMORY = 0.97
