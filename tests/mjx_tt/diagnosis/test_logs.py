@@ -155,6 +155,8 @@ def test_a_wrong_zero_of_an_encoder_is_named_where_the_pose_at_rest_is_given(tmp
     request, logs = diagnose.Request(out=str(tmp_path / "out"), home="home"), [str(tmp_path)]
     (cause,) = diagnose.run(logs, request, Console(quiet=True)).verdict.causes
     estimate = cause.parameters["joint_2.joint_offset"]
-    assert cause.name == "joint_2.joint_offset" and estimate.low <= 0.012 <= estimate.high
+    # The interval of 90 % misses in 5 of 40 seeds, and in this one: noise of 0.1 mrad in 500 states.
+    assert cause.name == "joint_2.joint_offset" and estimate.estimate == pytest.approx(0.012, abs=3e-5)
+    assert 0.0 < estimate.high - estimate.low < 6e-5
     without = diagnose.run(logs, replace(request, home=""), Console(quiet=True)).verdict
     assert not without.causes and any("joint_2.joint_offset" in why for why in without.not_identifiable)
