@@ -56,7 +56,8 @@ class Recovery:
         if status.state == "fault":
             return self._leave_fault(status)
         if not self._by_itself:
-            self._end_with(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
+            if reasons != f"arm: {status.ramping}":  # that passes by itself
+                self._end_with(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
             return None
         if self._again and status.axes:
             self._again = False

@@ -217,6 +217,7 @@ class Status:
     shown           balls so far that bounced where they must
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
+    ramping         the reason why the arm does not follow fully yet, which passes by itself, or None
     homing          the axes search their references
     preparable      the axes' reason is none that Prepare does not mend: they are switched off or not homed
     joints          name, unit, measured position, commanded velocity of each joint
@@ -262,6 +263,7 @@ class Status:
     timings: dict[str, Any] = field(default_factory=dict)
     stopped: str = ""
     unproven: str | None = None
+    ramping: str | None = None
     shown: int = 0
     tracker_trouble: str | None = None
     clock_trouble: str | None = None
@@ -288,7 +290,8 @@ class Status:
             at_home=bridge.state.value in ("ready", "active") and bridge.at_home,
             faults=tuple(FaultReport(f.cause.value, f.sentence) for f in bridge.gate.faults),
             present={cause.value: text for cause, text in bridge.gate.present.items()},
-            arm=session.problem(now) or session.ramping(now),
+            arm=session.problem(now),
+            ramping=session.ramping(now),
             axes=axes.problem(now),
             tracker=tracker.problem(now),
             joints=list(zip(contract.joints, contract.units, positions, velocities, strict=True)),
@@ -326,7 +329,7 @@ class Status:
     @property
     def missing(self) -> str:
         """The devices that cannot be used, each with its reason; empty: none."""
-        found = {"arm": self.arm, "axes": self.axes, "tracker": self.tracker}
+        found = {"arm": self.arm or self.ramping, "axes": self.axes, "tracker": self.tracker}
         return "; ".join(f"{name}: {reason}" for name, reason in found.items() if reason)
 
 

@@ -138,3 +138,13 @@ def test_what_is_missing_is_told_when_it_lasts():
     recovery.step(status(**SILENT), 0.0)
     with pytest.raises(TimeoutError, match="arm: silent; nothing heard"):
         recovery.step(status(**SILENT), LONGEST + 0.1)
+
+
+def test_what_passes_by_itself_is_waited_for():
+    """EGM that has begun anew ramps commands in for some seconds, after an emergency stop for instance."""
+    stop = {"present": {"estop": "the emergency stop is pressed"}, "arm": "motors off"}
+    recovery = Recovery(0.0, status(**stop))
+    ramps = replace(status("disarmed"), ramping="EGM has just begun")
+    sent = steps(recovery, status(**stop), status(), ramps, ramps)
+    assert sent == [Prepare(), Reset(), None, None] and not recovery.done
+    assert recovery.step(status("disarmed"), 1.0) is None and recovery.message == "all is well: press a to arm"
