@@ -12,6 +12,7 @@ brake, hold, and remember why.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -30,7 +31,9 @@ from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
 from robot_io.safety.ways import Silence, between, blocked, delayed, leads
 
-SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
+TRIES = 4  # velocities that are examined before the gate brakes
+AIM = 0.001  # [m] by which a slower velocity is to keep more than the gap that it must
+NEAR = 1e-4  # [m], [rad] between two places of which the gaps are compared
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
@@ -404,15 +407,18 @@ class SafetyGate:
         whole, rule = self._blade_share(braked, velocity)
         if rule:
             rules.append(rule)
-        for share in SHARES:
-            tried = velocity if share * whole == 1.0 else braked + share * whole * (velocity - braked)
+        tried = velocity if whole == 1.0 else braked + whole * (velocity - braked)
+        for _ in range(TRIES):
             way = self.braking_way(tried)
             if self._too_fast(way):
+                tried = 0.5 * (braked + tried)
                 continue
-            if self._clear(way, tried):
+            close = self._too_close(way, tried)
+            if close is None:
                 return tried, tuple(rules)
             if rules[-1:] != ["clearance"]:
                 rules.append("clearance")
+            tried = self._slow_down(tried, braked, *close)
         return braked, tuple(rules)
 
     def _blade_share(self, braked: np.ndarray, velocity: np.ndarray) -> tuple[float, str]:
@@ -436,41 +442,64 @@ class SafetyGate:
         acceleration = np.linalg.norm(np.diff(velocity), axis=0) / self.period
         return "blade_acceleration" if acceleration.max() > self.config.blade_acceleration else ""
 
-    def _clear(self, way: np.ndarray, velocity: np.ndarray) -> bool:
-        """True when a way of this period at ``velocity`` (8,) and of braking keeps the margins, or leaves one that is
-        missed already, whenever the next tick comes: until then, up to ``late``, the robot goes on at that velocity,
-        and all that comes after this period is shifted by it. And where none comes any more, nothing is touched."""
+    def _too_close(self, way: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Places (n, N) and the gaps (R,) that they must keep and do not, of the first proof that fails; None: clear.
+
+        A way of this period at ``velocity`` (8,) and of braking keeps the margins, or leaves one that is missed
+        already, whenever the next tick comes: until then, up to ``late``, the robot goes on at that velocity, and all
+        that comes after this period is shifted by it. And where none comes any more, nothing is touched.
+        """
         late = way.copy()
         late[:, 1:] += (self.config.late - self.period) * velocity[:, None]
-        ways, now = between(way, late), self._last or 0.0
-        past = self._monitor.past(now, float(self._leads.max()) + self.period)
-        true = delayed(way, late, past, now, self.period, self.config.late, self._leads)
-        if self.geometry.first_too_close(ways, self._margin, SLACK) is not None:
-            return False
-        if self.geometry.first_too_close(true, self._touch, SLACK) is not None:
-            return False
-        if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
-            if self.geometry.first_too_close(ways + self._deviation[:, None], self._touch, SLACK) is not None:
-                return False
-        if (np.abs(velocity) > FAST * self._v_max).any() and not self._clear_of_blocked(way):
-            return False
+        for places, least in self._proofs(way, late, velocity):
+            if self.geometry.first_too_close(places, least, SLACK) is not None:
+                return places, least
         beside = self._monitor.beside
         if beside.size and not all(self.geometry.clear_beside(each, beside, self._touch) for each in (way, late)):
-            return False
-        silent = self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period)
-        if self.geometry.first_too_close(silent, self._touch, SLACK) is not None:
-            return False
+            return late, self._touch
         if self._inside.any():
             gaps = self.geometry.gaps(way)[self._inside]
-            return bool((gaps[:, -1] > gaps[:, 0]).all())
-        return True
+            if not (gaps[:, -1] > gaps[:, 0]).all():
+                return way, self._margin
+        return None
 
-    def _clear_of_blocked(self, way: np.ndarray) -> bool:
-        """True when no joint that blocks before or on a way leads the others into anything, while nobody can know."""
-        low, high = self._monitor.reach
-        gone = np.concatenate([self._monitor.past(self._last or 0.0, self.config.delay)[1], way], axis=1)
-        stuck = blocked(gone[:, ::-STRIDE], np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1)))
-        return self.geometry.first_too_close(stuck, self._touch, SLACK) is None
+    def _proofs(
+        self, way: np.ndarray, late: np.ndarray, velocity: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Places (n, N) to which a velocity may lead, and the gaps (R,) that they must keep."""
+        ways, now = between(way, late), self._last or 0.0
+        yield ways, self._margin
+        past = self._monitor.past(now, float(self._leads.max()) + self.period)
+        yield delayed(way, late, past, now, self.period, self.config.late, self._leads), self._touch
+        if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
+            yield ways + self._deviation[:, None], self._touch
+        if (np.abs(velocity) > FAST * self._v_max).any():
+            low, high = self._monitor.reach
+            gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
+            ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))
+            yield blocked(gone[:, ::-STRIDE], *ends), self._touch
+        yield self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period), self._touch
+
+    def _slow_down(
+        self, velocity: np.ndarray, braked: np.ndarray, places: np.ndarray, least: np.ndarray
+    ) -> np.ndarray:
+        """A velocity (8,) between ``velocity`` and ``braked`` at which places (n, N) to which it leads keep ``least``.
+
+        Only the joints brake that lead to the worst place, those more that matter more there: the others may go on.
+        To first order; the caller proves it anew.
+        """
+        gaps = self.geometry.gaps(places) - least[:, None]
+        row, worst_place = np.unravel_index(gaps.argmin(), gaps.shape)
+        place = places[:, worst_place]
+        around = self.geometry.gaps(place[:, None] + np.column_stack([np.zeros_like(place), NEAR * np.eye(len(place))]))
+        slope = (around[row, 1:] - around[row, 0]) / NEAR
+        lasts = (place - self._reference) / np.where(velocity == 0.0, np.inf, velocity)  # [s] of motion at ``velocity``
+        gain = np.maximum(-slope * lasts * (velocity - braked), 0.0)  # [m] of gap, if a joint brakes wholly
+        wanted = max(0.0, -float(gaps[row, worst_place])) + AIM
+        share = gain * min(wanted / max(float(gain @ gain), 1e-12), 1.0 / max(float(gain.max()), 1e-12))
+        if gain.sum() < wanted:
+            share = np.where(gain.sum() < AIM, 0.5, 1.0 * (gain > 0.0))
+        return velocity - share * (velocity - braked)
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""

@@ -631,11 +631,23 @@ def gap_of_blocked(seed, delay=8):
 
 
 def test_a_joint_that_is_blocked_leads_the_others_into_nothing_before_it_is_noticed(monkeypatch):
-    """One attack in two hundred: within the time from a command to its measurement, in which no fault can come."""
-    assert min(gap_of_blocked(seed) for seed in (4, 7, 190)) > 0.0
+    """11 attacks of 600: within the time from a command to its measurement, in which no fault can come."""
+    assert min(gap_of_blocked(seed) for seed in (68, 128, 220)) > 0.0
     monkeypatch.setattr("robot_io.safety.gate.blocked", lambda way, low, high: way)
     with pytest.raises(AssertionError, match="CLEARANCE"):
-        gap_of_blocked(190)
+        gap_of_blocked(220)
+
+
+@pytest.mark.parametrize("joint", [3, 4])
+def test_only_the_joints_brake_that_lead_to_what_comes_close(joint):
+    """Joints 2 and 3 fold the arm onto the table and the base; gantry and joint 6 lead nowhere."""
+    ideal = Ideal(SafetyConfig(speed_scale=1.0), HOME + 0.22 * np.eye(8)[1])
+    request = V_MAX * (0.1 * np.eye(8)[[0, 7]].sum(axis=0) + 0.4 * np.eye(8)[joint])
+    sent = [ideal.tick(request) for _ in range(60)]
+    changed = np.array([s.velocity for s in sent if "clearance" in s.changed])
+    assert len(changed) > 3 and (changed[:, joint] < 0.99 * request[joint]).all()
+    np.testing.assert_allclose(changed[:, [0, 7]], np.broadcast_to(request[[0, 7]], (len(changed), 2)))
+    assert (GEOMETRY.gaps(ideal.positions) > MARGINS[:, None] - SLACK).all()
 
 
 def test_measured_speed_far_above_its_limit_is_a_fault():
