@@ -37,7 +37,6 @@ NEAR = 1e-4  # [m], [rad] between two places of which the gaps are compared
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
-FAST = 0.25  # share of a joint's highest speed above which the others are proven clear of its blocking
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
 LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
@@ -473,16 +472,13 @@ class SafetyGate:
         yield delayed(way, late, past, now, self.period, self.config.late, self._leads), self._touch
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             yield ways + self._deviation[:, None], self._touch
-        if (np.abs(velocity) > FAST * self._v_max).any():
-            low, high = self._monitor.reach
-            gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
-            ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))
-            yield blocked(gone[:, ::-STRIDE], *ends), self._touch
+        low, high = self._monitor.reach
+        gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
+        ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))
+        yield blocked(gone[:, ::-STRIDE], *ends), self._touch
         yield self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period), self._touch
 
-    def _slow_down(
-        self, velocity: np.ndarray, braked: np.ndarray, places: np.ndarray, least: np.ndarray
-    ) -> np.ndarray:
+    def _slow_down(self, velocity: np.ndarray, braked: np.ndarray, places: np.ndarray, least: np.ndarray) -> np.ndarray:
         """A velocity (8,) between ``velocity`` and ``braked`` at which places (n, N) to which it leads keep ``least``.
 
         Only the joints brake that lead to the worst place, those more that matter more there: the others may go on.
