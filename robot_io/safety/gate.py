@@ -29,11 +29,9 @@ from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
 from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
-from robot_io.safety.ways import Silence, between, blocked, delayed, leads
+from robot_io.safety.ways import Silence, between, blocked, delayed, leads, slow_down
 
 TRIES = 4  # velocities that are examined before the gate brakes
-AIM = 0.001  # [m] by which a slower velocity is to keep more than the gap that it must
-NEAR = 1e-4  # [m], [rad] between two places of which the gaps are compared
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
@@ -417,7 +415,7 @@ class SafetyGate:
                 return tried, tuple(rules)
             if rules[-1:] != ["clearance"]:
                 rules.append("clearance")
-            tried = self._slow_down(tried, braked, *close)
+            tried = slow_down(self.geometry, self._reference, tried, braked, *close)
         return braked, tuple(rules)
 
     def _blade_share(self, braked: np.ndarray, velocity: np.ndarray) -> tuple[float, str]:
@@ -477,25 +475,6 @@ class SafetyGate:
         ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))
         yield blocked(gone[:, ::-STRIDE], *ends), self._touch
         yield self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period), self._touch
-
-    def _slow_down(self, velocity: np.ndarray, braked: np.ndarray, places: np.ndarray, least: np.ndarray) -> np.ndarray:
-        """A velocity (8,) between ``velocity`` and ``braked`` at which places (n, N) to which it leads keep ``least``.
-
-        Only the joints brake that lead to the worst place, those more that matter more there: the others may go on.
-        To first order; the caller proves it anew.
-        """
-        gaps = self.geometry.gaps(places) - least[:, None]
-        row, worst_place = np.unravel_index(gaps.argmin(), gaps.shape)
-        place = places[:, worst_place]
-        around = self.geometry.gaps(place[:, None] + np.column_stack([np.zeros_like(place), NEAR * np.eye(len(place))]))
-        slope = (around[row, 1:] - around[row, 0]) / NEAR
-        lasts = (place - self._reference) / np.where(velocity == 0.0, np.inf, velocity)  # [s] of motion at ``velocity``
-        gain = np.maximum(-slope * lasts * (velocity - braked), 0.0)  # [m] of gap, if a joint brakes wholly
-        wanted = max(0.0, -float(gaps[row, worst_place])) + AIM
-        share = gain * min(wanted / max(float(gain @ gain), 1e-12), 1.0 / max(float(gain.max()), 1e-12))
-        if gain.sum() < wanted:
-            share = np.where(gain.sum() < AIM, 0.5, 1.0 * (gain > 0.0))
-        return velocity - share * (velocity - braked)
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 
+AIM = 0.001  # [m] by which a slower velocity is to keep more than the gap that it must
+NEAR = 1e-4  # [m], [rad] between two places of which the gaps are compared
 BRAKED = np.array([0.0, 0.5, 1.0])  # shares of the time that braking takes at which its way is examined
 
 
@@ -66,6 +69,36 @@ def blocked(way: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         there[joint], back[joint] = low[joint], high[joint]
         parts += [there, back, way[:, :1]]
     return np.concatenate(parts, axis=1)
+
+
+def slow_down(
+    geometry: RobotGeometry,
+    reference: np.ndarray,
+    velocity: np.ndarray,
+    braked: np.ndarray,
+    places: np.ndarray,
+    least: np.ndarray,
+) -> np.ndarray:
+    """A velocity (n,) from a reference (n,), between ``velocity`` and ``braked``, that leads to wider gaps.
+
+    Only the joints brake that lead to the worst of the places (n, N), so far that it keeps gaps of ``least`` (R,), and
+    those more that matter more there; the others may go on. To first order: the caller has to prove it anew.
+    """
+    gaps = geometry.gaps(places) - least[:, None]
+    row, worst = np.unravel_index(gaps.argmin(), gaps.shape)
+    place = places[:, worst]
+    around = geometry.gaps(place[:, None] + np.column_stack([np.zeros_like(place), NEAR * np.eye(len(place))]))
+    slope = (around[row, 1:] - around[row, 0]) / NEAR
+    lasts = (place - reference) / np.where(velocity == 0.0, np.inf, velocity)  # [s] of motion at ``velocity``
+    gain = np.maximum(-slope * lasts * (velocity - braked), 0.0)  # [m] of gap, if a joint brakes wholly
+    wanted = max(0.0, -float(gaps[row, worst])) + AIM
+    if gain.sum() < AIM:
+        share = np.full_like(gain, 0.5)
+    elif gain.sum() < wanted:
+        share = (gain > 0.0).astype(float)
+    else:
+        share = gain * min(wanted / float(gain @ gain), 1.0 / float(gain.max()))
+    return velocity - share * (velocity - braked)
 
 
 class Silence:

@@ -20,6 +20,7 @@ from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.faults import Cause, FaultLatch
 from robot_io.safety.gate import GateState, SafetyConfig, SafetyGate
+from robot_io.safety.ways import slow_down
 
 T = 1 / 75
 LOWER, UPPER, V_MAX, A_MAX, MARGIN = (
@@ -648,6 +649,17 @@ def test_only_the_joints_brake_that_lead_to_what_comes_close(joint):
     assert len(changed) > 3 and (changed[:, joint] < 0.99 * request[joint]).all()
     np.testing.assert_allclose(changed[:, [0, 7]], np.broadcast_to(request[[0, 7]], (len(changed), 2)))
     assert (GEOMETRY.gaps(ideal.positions) > MARGINS[:, None] - SLACK).all()
+
+
+def test_a_carriage_is_slowed_down_by_what_the_gap_lacks():
+    """Towards the table's edge gaps fall by the carriage's way: 0.3 s at 1 m/s lack 0.02 m, and 1 mm more is kept."""
+    start, velocity = HOME + 0.1 * np.eye(8)[1], np.array([0.5, 1.0, 0, 0, 0, 0, 0, 1.0])
+    place = start + 0.3 * velocity
+    least = GEOMETRY.gaps(place[:, None])[:, 0] - 1.0
+    row = GEOMETRY.rows.index("col_upper_arm to the table")
+    least[row] += 1.02
+    slowed = slow_down(GEOMETRY, start, velocity, ZERO, place[:, None], least)
+    np.testing.assert_allclose(slowed, [0.5, 1.0 - 0.021 / 0.3, 0, 0, 0, 0, 0, 1.0], atol=1e-6)
 
 
 def test_measured_speed_far_above_its_limit_is_a_fault():
