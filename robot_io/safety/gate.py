@@ -31,7 +31,7 @@ from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
 from robot_io.safety.ways import Silence, between, blocked, delayed, leads, slow_down
 
-TRIES = 4  # velocities that are examined before the gate brakes
+TRIES = 3  # velocities that are examined before the gate brakes
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
@@ -464,6 +464,8 @@ class SafetyGate:
         self, way: np.ndarray, late: np.ndarray, velocity: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Places (n, N) to which a velocity may lead, and the gaps (R,) that they must keep."""
+        # What fails most comes first.
+        yield self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period), self._touch
         ways, now = between(way, late), self._last or 0.0
         yield ways, self._margin
         past = self._monitor.past(now, float(self._leads.max()) + self.period)
@@ -474,7 +476,6 @@ class SafetyGate:
         gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
         ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))
         yield blocked(gone[:, ::-STRIDE], *ends), self._touch
-        yield self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period), self._touch
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""
