@@ -355,6 +355,7 @@ class Commissioning:
         for i in reversed(self._arm):  # the fastest first
             start = self._measured()[i]
             self._rush(i, 0.7)
+            self._session_time(1.0)
             trace = self._trace()
             wanted, reached = (_fastest(_rate(trace.time, x[:, i])) for x in (trace.reference, trace.measured))
             if reached < SPEED * wanted:
@@ -393,13 +394,17 @@ class Commissioning:
         for i, name in enumerate(self._contract.joints):
             self._arm_robot()
             start = self._measured()[i]
-            self._rush(i, 1.4 if self._contract.units[i] == "m" else 0.7, stop=True)
+            self._rush(i, 1.4 if self._contract.units[i] == "m" else 0.7)
+            self._session.send(messages.Stop())
+            stopped = self._wait(lambda s: s.state not in ("ready", "active"), "the stop").time
             self._until(lambda s: s.state == "disarmed", 5.0)
+            self._session_time(0.5)
             trace = self._trace()
             speed = _rate(trace.time, trace.reference[:, i])
             fastest, way = _fastest(speed), np.sign(np.median(speed[np.abs(speed) > 0.5 * _fastest(speed)]))
             fast = way * speed > 0.8 * fastest
-            last = int(fast.argmax()) + int(np.argmin(fast[fast.argmax() :])) + SPAN - 1  # where it begins to brake
+            # Where it begins to brake; a jogging computer that stalls lets it slow down before.
+            last = int(np.flatnonzero(fast & (trace.time[SPAN:] <= stopped))[-1]) + SPAN
             proven = fastest**2 / (2.0 * limits.acceleration[i]) + fastest / self._config.rate
             end = float(way * trace.reference[last, i]) + proven
             over = float((way * trace.measured[last:, i]).max()) - end
@@ -560,17 +565,14 @@ class Commissioning:
         self._session_time(0.5)
         self._check_fault()
 
-    def _rush(self, i: int, seconds: float, stop: bool = False) -> None:
-        """Move a joint away from the nearer end of its range at 10 % speed, then let it come to rest or stop it."""
+    def _rush(self, i: int, seconds: float) -> None:
+        """Move a joint away from the nearer end of its range at 10 % speed."""
         limits, unit = self._contract.limits, self._contract.units[i]
         way = 1.0 if self._measured()[i] < 0.5 * (limits.lower[i] + limits.upper[i]) else -1.0
         step = tuple(way * {"m": 0.02, "rad": 0.05}[unit] * np.eye(self._contract.n_joints)[i])
         for _ in range(round(seconds / 0.02)):
             self._session.send(messages.Jog(step, FAST))
             self._session_time(0.02)
-        if stop:
-            self._session.send(messages.Stop())
-        self._session_time(1.0)
 
     def _trace(self) -> messages.Traced:
         self._session.send(messages.Trace())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -106,7 +106,7 @@ def _first_ball(
         operator.do("switch_on", "start the arm's RAPID program again: EGM ended with the session before")
         session.prepare(None)
         operator.do("throw", "throw balls one by one from the player's end: three are watched, then the robot is armed")
-        _until(session, lambda s: not s.unproven, "balls that show the tracker's frame")
+        _wait_for_balls(session)
         session.send(messages.Arm())  # so slow a robot is rarely at its home pose between two balls
         end = time.monotonic() + 2.0 * WAIT
         while time.monotonic() < end:
@@ -122,10 +122,13 @@ def _first_ball(
     raise NotProven("no ball was played")
 
 
-def _until(session: ControlSession, condition: Callable[[messages.Status], bool], what: str) -> None:
-    end = time.monotonic() + 2.0 * WAIT
+def _wait_for_balls(session: ControlSession) -> None:
+    """Until balls have shown the tracker's frame. Raises NotProven with what is not shown."""
+    end, lacks = time.monotonic() + 2.0 * WAIT, "no status"
     while time.monotonic() < end:
         for message in session.messages(0.1):
-            if isinstance(message, messages.Status) and condition(message):
-                return
-    raise NotProven(f"waited for {what}")
+            if isinstance(message, messages.Status):
+                if not message.unproven:
+                    return
+                lacks = f"{message.unproven} {message.shown} were seen"
+    raise NotProven(f"waited {2.0 * WAIT:g} s for balls: {lacks}")
