@@ -147,7 +147,7 @@ class Detector:
     Args:
         folder: where the network and the search's classifier are.
         rate: frames a second [Hz].
-        most: windows that are looked at; the search fills what guesses and the last balls leave.
+        most: windows that the search may fill.
         threshold: least probability of what is reported.
         bayer: order of the frames' colours.
     """
@@ -156,7 +156,7 @@ class Detector:
         self,
         folder: str | Path,
         rate: float = 125.0,
-        most: int = 6,
+        most: int = 3,
         threshold: float = 0.5,
         bayer: str = "RGGB",
     ) -> None:
@@ -193,10 +193,13 @@ class Detector:
             return []
         middles: list[np.ndarray] = []
         extent = np.array(self._frames[0].shape[::-1])
-        told = [guess - self._cut for guess in guesses]
-        for middle in [*told, *self._expected, *self._search()] if search else told:
+        for middle in [
+            *(guess - self._cut for guess in guesses),
+            *(self._expected if search else ()),
+            *(self._search() if search else ()),
+        ]:
             inside = (middle > -APART).all() and (middle < extent + APART).all()
-            if inside and _is_apart(middle, middles) and len(middles) < max(self.most, len(told)):
+            if inside and _is_apart(middle, middles):
                 middles.append(middle)
         found = self._look(middles) if middles else []
         self._expected = [d.centre - self._cut + d.velocity / self.rate for d in found[:2]]
