@@ -83,4 +83,4 @@ class Recovery:
 def only_unprepared(status: Status) -> bool:
     """Nothing is missing or present but axes without power or reference, which Prepare gives them."""
     others = set(status.present) - {Cause.AXIS_LOST.value}
-    return not (status.arm or status.tracker or others) and (not status.axes or status.preparable)
+    return not (status.arm or status.ramping or status.tracker or others) and (not status.axes or status.preparable)

@@ -472,6 +472,8 @@ class SafetyGate:
         yield delayed(way, late, past, now, self.period, self.config.late, self._leads), self._touch
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             yield ways + self._deviation[:, None], self._touch
+        if self._inside.any():  # it creeps away, and where it is counts as too close for any joint's blocking
+            return
         low, high = self._monitor.reach
         gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)
         ends = np.minimum(low, way.min(axis=1)), np.maximum(high, way.max(axis=1))

@@ -12,6 +12,7 @@ from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 
 AIM = 0.001  # [m] by which a slower velocity is to keep more than the gap that it must
+LONGEST = 2.0  # [s] for which a velocity is taken to last, at most
 NEAR = 1e-4  # [m], [rad] between two places of which the gaps are compared
 BRAKED = np.array([0.0, 0.5, 1.0])  # shares of the time that braking takes at which its way is examined
 
@@ -89,7 +90,8 @@ def slow_down(
     place = places[:, worst]
     around = geometry.gaps(place[:, None] + np.column_stack([np.zeros_like(place), NEAR * np.eye(len(place))]))
     slope = (around[row, 1:] - around[row, 0]) / NEAR
-    lasts = (place - reference) / np.where(velocity == 0.0, np.inf, velocity)  # [s] of motion at ``velocity``
+    # [s] of motion at ``velocity``; a place may lie off for other reasons, which no velocity explains.
+    lasts = np.clip((place - reference) / np.where(velocity == 0.0, np.inf, velocity), 0.0, LONGEST)
     gain = np.maximum(-slope * lasts * (velocity - braked), 0.0)  # [m] of gap, if a joint brakes wholly
     wanted = max(0.0, -float(gaps[row, worst])) + AIM
     if gain.sum() < AIM:

@@ -27,6 +27,7 @@ LIFTS, LIFT, LARGEST = 5, 0.05, 0.3  # steps away from what is nearest, [m] of e
 TINY = 1e-6  # [m], [rad] of a finite difference
 THERE, BY = 2e-3, 0.02  # [m], [rad] from a place that counts as reached, and as passed on the way back
 ARRIVED = 1e-4  # [m], [rad]
+STUCK = 1e-3  # [m/s], [rad/s] below which the gate holds the robot
 SLOWER, SLOWEST = 0.5, 0.1  # share of the pace after each failure, and the least
 RAMP = 0.9  # share of the acceleration limits
 
@@ -83,7 +84,7 @@ class WayHome:
     def sent(self, request: np.ndarray, sent: Sent, target: np.ndarray, homeward: bool) -> bool:
         """Take what became of a request; ``homeward``: it was one of ours. True where another way is looked for now."""
         self._remember(sent.position, target)
-        held = request.any() and not sent.velocity.any() and "clearance" in sent.changed
+        held = request.any() and np.abs(sent.velocity).max() < STUCK and "clearance" in sent.changed
         if not (homeward and held) or self._search is not None or self.problem:
             return False
         if self._way:

@@ -16,9 +16,11 @@ UNPLUGGED = {"present": {"axis_lost": "x is lost"}, "axes": "x is lost"}
 UNHOMED = {"axes": "x is not homed", "preparable": True}
 
 
-def status(state="fault", faults=None, present=None, arm=None, axes=None, preparable=False, tracker=None):
+def status(state="fault", faults=None, present=None, arm=None, axes=None, preparable=False, tracker=None, ramping=None):
     faults = (FAULT,) * (state == "fault") if faults is None else faults
-    return Status(0.0, state, False, False, faults, present or {}, arm, axes, tracker, [], preparable=preparable)
+    return Status(
+        0.0, state, False, False, faults, present or {}, arm, axes, tracker, [], preparable=preparable, ramping=ramping
+    )
 
 
 def steps(recovery, *statuses):
@@ -54,10 +56,11 @@ def test_a_lost_reference_is_found_after_the_reset():
         SILENT,
         {"present": {"estop": "the emergency stop is pressed"}},
         UNPLUGGED,
+        {"ramping": "EGM has just begun"},
         {"tracker": "silent"},
         {"present": {"limit": "joint_1 is out of its range"}},
     ],
-    ids=["arm", "emergency stop", "cable", "tracker", "place"],
+    ids=["arm", "emergency stop", "cable", "arm just switched on", "tracker", "place"],
 )
 @pytest.mark.parametrize("at_the_key", [True, False])
 def test_nothing_moves_because_somebody_else_mends_something(mended, at_the_key):

@@ -651,6 +651,18 @@ def test_only_the_joints_brake_that_lead_to_what_comes_close(joint):
     assert (GEOMETRY.gaps(ideal.positions) > MARGINS[:, None] - SLACK).all()
 
 
+@pytest.mark.parametrize("gap", [0.004, 0.008, 0.015])
+def test_a_robot_armed_close_to_itself_gets_away(gap):
+    """Joint 3 was folded until the robot almost touched itself; asked to unfold, it does."""
+    fold = np.eye(8)[4]
+    steps = HOME[:, None] + fold[:, None] * np.linspace(0.0, 1.7, 17001)
+    place = steps[:, int(np.argmax(GEOMETRY.gaps(steps).min(axis=0) < gap))]
+    ideal = Ideal(SafetyConfig(speed_scale=1.0), place)
+    for _ in range(150):
+        ideal.tick(-0.5 * V_MAX * fold)
+    assert GEOMETRY.gaps(ideal.position[:, None]).min() > 0.1 and not ideal.gate.faults
+
+
 def test_a_carriage_is_slowed_down_by_what_the_gap_lacks():
     """Towards the table's edge gaps fall by the carriage's way: 0.3 s at 1 m/s lack 0.02 m, and 1 mm more is kept."""
     start, velocity = HOME + 0.1 * np.eye(8)[1], np.array([0.5, 1.0, 0, 0, 0, 0, 0, 1.0])

@@ -18,7 +18,7 @@ from robot_io.safety.gate import SafetyGate
 # Where the joints' own ways home lead into the table's margin, and the gate does not get them round it.
 HELD = {
     "fr3_pedestal": (0.0566, 1.5088, -1.4539, -0.8161, -2.2759, 2.8386, 2.1002),
-    "ur10e_rail": (-0.7234, 1.8185, -2.4765, -0.6282, -0.2243, -1.8801, -3.5772),
+    "ur10e_rail": (0.1571, 2.5301, -2.6103, -1.4905, -4.3653, -6.0512, -5.2109),
 }
 LONGEST, BY_ITSELF = 20.0, 4.0  # [s]
 
