@@ -32,7 +32,7 @@ from robot_io.safety.stopping import StopReference
 from robot_io.safety.ways import Silence, between, blocked, delayed, leads, slow_down
 
 TRIES = 3  # velocities that are examined before the gate brakes
-HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
+HALVINGS = 5  # of the way from braking to the limited request, in search of what keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 STRIDE = 2  # periods between two places of a way beside which a joint may be blocked
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
@@ -472,7 +472,7 @@ class SafetyGate:
         yield delayed(way, late, past, now, self.period, self.config.late, self._leads), self._touch
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             yield ways + self._deviation[:, None], self._touch
-        if self._inside.any():  # it creeps away, and where it is counts as too close for any joint's blocking
+        if self._inside.any():  # it creeps away; for a joint that blocks, even where it is counts as too close
             return
         low, high = self._monitor.reach
         gone = np.concatenate([self._monitor.past(now, self.config.delay)[1], way], axis=1)

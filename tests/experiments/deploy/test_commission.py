@@ -76,6 +76,10 @@ MISTAKES = {
 }
 
 
+CALLS = 4  # in real time
+STALLED = r"stopped by (timing|stale_\w+)"  # by this machine, not by the robot
+
+
 def commissioning(tmp_path, params=RIG, done=(), **answers):
     path = tmp_path / "robot.yaml"
     path.write_text("name: lab\n")
@@ -86,10 +90,6 @@ def commissioning(tmp_path, params=RIG, done=(), **answers):
     person = Person(LockStepHands(session.rig), **answers)
     made = Commissioning(session, person, RobotConfig(), record, begin_play=lambda: "the first ball was played")
     return made, session, person
-
-
-CALLS = 4
-STALLED = r"stopped by (timing|stale_\w+)"  # this machine, not the robot
 
 
 @pytest.mark.parametrize("name", MISTAKES)

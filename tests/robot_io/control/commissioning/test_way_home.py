@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -116,6 +116,16 @@ def test_back_along_its_own_way_where_nothing_else_is_clear(monkeypatch):
     late = np.array(ideal.places)
     assert max(np.abs(np.array(went) - place).max(axis=1).min() for place in late[::5]) < short
     assert np.abs(late - beside).max(axis=1).min() < 0.1  # by the same bend
+
+
+def test_a_robot_that_only_creeps_is_held():
+    """Beside the joint that the gate stops the others converge, at speeds that never become zero."""
+    ideal = Ideal("fr3_pedestal")
+    ideal.arm(np.array(HELD["fr3_pedestal"]))
+    sent = ideal.gate.command(np.zeros(7), ideal.gate.reference, np.zeros(7), 0.0)
+    crept, moves = (replace(sent, velocity=np.full(7, v), changed=("clearance",)) for v in (1e-17, 0.1))
+    assert not ideal.way.sent(np.ones(7), moves, ideal.robot.home, True)
+    assert ideal.way.sent(np.ones(7), crept, ideal.robot.home, True)
 
 
 def test_without_a_way_it_holds_and_says_so():
