@@ -16,6 +16,7 @@ from experiments.vision.crops import SEEN
 from robot_io.vision.camera import Camera
 from robot_io.vision.detection import Detection
 from robot_io.vision.detector import Detector
+from robot_io.vision.tracker import BallTracker
 
 WITHIN = 6.0  # [px] of a rendered ball's centre that count as found
 EDGE = 5.0  # [px] from the picture's edge that a ball's centre must be away
@@ -175,11 +176,12 @@ def evaluate_rendered(
 
 @dataclass(frozen=True)
 class Ghosts:
-    """What was seen where no ball was: ``frames`` of one camera, and ``pairs`` of detections whose rays meet."""
+    """What was seen where no ball was: ``pairs`` of detections whose rays meet, and frames with a ball ``reported``."""
 
     stereo_frames: int
     detections: int
     pairs: int
+    reported: int
 
     def lines(self) -> list[str]:
         """The figures, as text."""
@@ -187,6 +189,7 @@ class Ghosts:
             f"{self.stereo_frames} stereo frames of play without a ball",
             f"detections {self.detections}, {self.detections / max(self.stereo_frames, 1) / 2:.5f} a frame",
             f"pairs of detections whose rays meet {self.pairs}",
+            f"frames in which the tracker reports a ball {self.reported}",
         ]
 
 
@@ -200,10 +203,10 @@ def evaluate_empty(
     report: Callable[[int], object] = lambda done: None,
 ) -> Ghosts:
     """People and a robot pretend to play for some seconds, in a new hall every few: what is taken for a ball."""
-    stereo = detections = pairs = 0
+    stereo = detections = pairs = reported = 0
     while stereo < seconds * rate:
         scenes, actors = [pictures.make_scene(camera, rng) for camera in cameras], pictures.Actors(rng)
-        detectors = [Detector(folder, rate) for _ in cameras]
+        detectors, tracker = [Detector(folder, rate) for _ in cameras], BallTracker(cameras)
         begin, phase = rng.uniform(0, 100), rng.uniform(0, 1)
         for k in range(int(scene_seconds * rate)):
             time = begin + k / rate
@@ -211,11 +214,15 @@ def evaluate_empty(
             swing = np.cos(2 * np.pi * (k / rate + phase))
             shapes = actors.capsules(time, np.array([0.3 * np.sin(3 * time), 2.0 * swing, 0.25]))
             shots = [pictures.render(scene, pictures.no_ball, time, rng, shapes) for scene in scenes]
-            found = [detector.detect(shot.frame) for detector, shot in zip(detectors, shots, strict=True)]
+            found = [
+                detector.detect(shot.frame, guesses)
+                for detector, shot, guesses in zip(detectors, shots, tracker.guesses(time), strict=True)
+            ]
+            reported += tracker.update(time, found) is not None
             stereo, detections = stereo + 1, detections + sum(len(f) for f in found)
             pairs += sum(rays_meet(cameras, a, b) for a in found[0] for b in found[1])
         report(stereo)
-    return Ghosts(stereo, detections, pairs)
+    return Ghosts(stereo, detections, pairs, reported)
 
 
 def rays_meet(cameras: tuple[Camera, Camera], first: Detection, second: Detection) -> bool:

@@ -18,7 +18,7 @@ from robot_io.vision.detection import Detection
 from robot_io.vision.sources import Source
 
 RING = 8  # frames in shared memory: those that the detector compares, and those that are looked at outside
-GUESSES = 4  # places that a camera is told
+GUESSES = 20  # places that a camera is told
 START_TIME = 20.0  # [s]
 
 

@@ -21,8 +21,12 @@ from robot_io.vision.triangulation import Sight, triangulate
 PHYSICS = Physics(drag=0.141, lift=0.0033, wander=0.1, bounced=(0.5, 0.25, 60.0))
 CLUTTER, FADING = 5.0, 0.9  # evidence that a place of clutter has; share of it that is left after a frame
 SUREST = 0.993  # probability beyond which more counts no more
-UNSEEN = 2.0  # evidence that a frame without a place takes
+EXPECTED = 3.0  # evidence of a place where something fast was expected: clutter is seldom there
+UNSEEN = 2.0  # evidence that a frame takes in which no camera saw it
 ROOM = np.array([[-4.0, -5.0, -0.8], [4.0, 5.0, 3.0]])  # [m] in which there are balls
+PLAY = np.array([[-1.0, -1.8, 0.0], [1.0, 2.3, 1.2]])  # [m] in which one that a single camera sees is sought
+STRIDE = 48.0  # [px] between the places where it is sought: a detector's window less the ball
+PLACES = 16  # of them, at most
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class TrackerOptions:
     sure: float = 0.8
     struck: float = 0.5
     fast: float = 2.5
-    hits: int = 3
+    hits: int = 2
     score: float = 7.0
     margin: float = 6.0
     slow_hits: int = 10
@@ -114,16 +118,26 @@ class BallTracker:
     reported: Hypothesis | None = None
     number: int = 0
     sights: list[Sight] = field(default_factory=list)  # of the newest frame
+    alone: list[Detection | None] = field(default_factory=list)  # of each camera, the surest that no other one shares
 
     def guesses(self, time: float) -> list[list[np.ndarray]]:
-        """Of every camera, the pixels (2,) at which the two likeliest hypotheses will be."""
+        """Of every camera, the pixels (2,) at which the two likeliest hypotheses will be.
+
+        Where no ball is believed and a camera sees one alone, also those at which it would be for the other.
+        """
         ahead = [h.at(time)[:3] for h in self.hypotheses[:2]]
         pixels = [[camera.project(point) for point in ahead] for camera in self.cameras]
+        if self.reported is None:
+            for seen, camera, row in zip(self.alone, self.cameras[:2], pixels[1::-1], strict=False):
+                other = self.cameras[1] if camera is self.cameras[0] else self.cameras[0]
+                row += [] if seen is None else find_along(camera, seen, other)
         return [[p for p in row if np.isfinite(p).all()] for row in pixels]
 
     def update(self, time: float, detections: Sequence[Sequence[Detection]]) -> TrackedBall | None:
         """Takes what each camera saw in the frame exposed at ``time`` [s]; the ball, None where none is believed."""
         self.sights = self._find_sights(detections)
+        shared = {id(d) for sight in self.sights for d in sight.detections}
+        self.alone = [next((d for d in row if id(d) not in shared), None) for row in detections[:2]]
         for h in self.hypotheses:
             h.ball.predict(time - h.time)
             h.time = time
@@ -157,16 +171,19 @@ class BallTracker:
             for camera, detection in zip(self.cameras, sight.detections, strict=False):
                 self._take(h, camera, detection, np.inf)
             h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
-            h.score = FADING * h.score + weigh(sight)
+            h.score = FADING * h.score + weigh(sight) + EXPECTED * (h.speed > self.options.fast)
             return
-        h.score = FADING * h.score - UNSEEN
+        h.score *= FADING
         if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
+            h.score -= UNSEEN
             return  # both cameras see it elsewhere
         for camera, seen in zip(self.cameras, detections, strict=True):
             near = [(self._misfit(h, camera, d), i) for i, d in enumerate(seen)]
             if near and min(near)[0] < self.options.gate:
                 self._take(h, camera, seen[min(near)[1]], self.options.gate)
                 h.seen = h.time
+        if h.seen < h.time:
+            h.score -= UNSEEN
 
     def _distance(self, h: Hypothesis, sight: Sight) -> float:
         r = sight.point - h.ball.mean[:3]
@@ -243,6 +260,23 @@ class BallTracker:
         options = self.options
         enough = options.hits if h.speed > options.fast else options.slow_hits
         return h.speed > options.slowest and h.hits >= enough and h.score > options.score
+
+
+def find_along(camera: Camera, seen: Detection, other: Camera) -> list[np.ndarray]:
+    """Pixels (2,) of another camera, STRIDE apart, at which the ball may be that a camera sees alone."""
+    ray = camera.rays(seen.centre[None])[0]
+    with np.errstate(divide="ignore"):
+        ends = np.sort((PLAY - camera.centre) / ray, axis=0)
+    first, last = max(ends[0].max(), 0.0), ends[1].min()
+    if first >= last:
+        return []
+    line = [other.project(camera.centre + at * ray) for at in np.linspace(first, last, 64)]
+    places: list[np.ndarray] = []
+    for pixel in line:
+        inside = np.isfinite(pixel).all() and (pixel >= 0.0).all() and (pixel < other.size).all()
+        if inside and len(places) < PLACES and all(np.linalg.norm(pixel - place) >= STRIDE for place in places[-1:]):
+            places.append(pixel)
+    return places
 
 
 def weigh(sight: Sight) -> float:

@@ -128,3 +128,28 @@ def test_guesses_lie_where_the_ball_will_be():
         tracker.update(k * 1e-3, [[detect(c, places[k], velocities[k], rng)] for c in CAMERAS])
     for camera, guesses in zip(CAMERAS, tracker.guesses(0.080), strict=True):
         assert guesses[0] == pytest.approx(camera.project(places[80]), abs=2.0)
+
+
+@pytest.mark.parametrize("blind", [0, 1])
+def test_what_one_camera_sees_alone_is_sought_along_its_ray_by_the_other(blind):
+    places, velocities = fly()
+    rng, tracker = np.random.default_rng(5), BallTracker(CAMERAS)
+    seen = [[detect(c, places[100], velocities[100], rng)] for c in CAMERAS]
+    seen[blind] = []
+    assert tracker.update(0.0, seen) is None
+    guesses = tracker.guesses(PERIOD)
+    assert not guesses[1 - blind]
+    # Half of a window reaches 32 px to each side, and the ball flew on for a period.
+    ball = CAMERAS[blind].project(places[108])
+    assert min(np.abs(guess - ball).max() for guess in guesses[blind]) < 32.0 - 3.0
+
+
+def test_a_ball_that_is_unsure_everywhere_but_where_it_was_expected_is_believed():
+    places, velocities = fly()
+    rng, tracker, found = np.random.default_rng(6), BallTracker(CAMERAS), []
+    for k in range(0, 80, 8):
+        seen = [[detect(c, places[k], velocities[k], rng, probability=0.9)] for c in CAMERAS]
+        if k % 32 == 16:
+            seen[0] = []  # hidden from one camera
+        found.append(tracker.update(k * 1e-3, seen) is not None)
+    assert all(found[6:])
