@@ -28,6 +28,7 @@ ROUNDS = 8
 EARLY = 2  # of them, in which no cause has to be worth its name
 PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
+STEPS = (1.0, 0.5, 0.25)  # of the way to where the linear model leads
 NO_ERROR = 1e-6  # [m^2] beside the noise, below which there is nothing to take away: a millimetre
 PRICE_OF_SPINS = 20.0  # the same of a coefficient of lift and of the nine numbers of a distribution
 SPIKE, VISIBLE = 1e-4, 1.5e-5  # [m] by which what is not chosen may be off, at a flight's end and in rms of its samples
@@ -99,6 +100,7 @@ def search(
         frame = noise.flight_frame(linear.base.velocity[:, :, 0])
         # What the model does not explain yet is smooth, and would pass for noise that remembers itself: the noise is
         # what effects and discrepancy together leave.
+        known = prior
         for pass_ in range(1 if round_ else 2):
             if not round_ and not pass_:
                 own = noise.without_memory(noise.estimate(linear.residual, frame, g, unknowns))
@@ -117,6 +119,8 @@ def search(
         size, covariance, _ = model.solve(chosen)
         inside = [*model.always, *chosen]
         theta = sizes.theta(model, chosen)
+        begun = np.where(np.isin(np.arange(count), inside), at.theta, 0.0)
+        theta, prior = _step(sizes, begun, theta, known, prior)
         say(f"round {round_ + 1}: {', '.join(problem.effects[i].name for i in inside) or 'nothing'}")
         moved = np.abs(theta - at.theta)[inside] / np.sqrt(np.diagonal(covariance))[inside]
         if chosen == before and round_ >= EARLY and np.max(moved, initial=0.0) < SETTLED:
@@ -131,6 +135,27 @@ def search(
         at = Situation(theta, start)
     level = sizes.of(left, unknowns)
     return Search(at, linear, own, prior, model, columns, picked, shift, spin_shift, level)
+
+
+def _step(
+    sizes: Sizes,
+    begun: Float[np.ndarray, " K"],
+    aim: Float[np.ndarray, " K"],
+    known: SpinPrior | None,
+    learnt: SpinPrior | None,
+) -> tuple[Float[np.ndarray, " K"], SpinPrior | None]:
+    """Changes on the way to the linear model's, as far as they are an improvement, and the spins' distribution there.
+
+    The linear model is right nearby only: a way that makes the flights less likely under the model itself is halved.
+    """
+    before = sizes.unlikely(begun, known)
+    for part in STEPS:
+        theta, prior = begun + part * (aim - begun), learnt
+        if learnt is not None and known is not None:
+            prior = learnt.moved((part - 1.0) * (learnt.mean - known.mean))
+        if sizes.unlikely(theta, prior) < before + SETTLED:
+            return theta, prior
+    return begun, known
 
 
 def spins_pay(problem: BallProblem, plain: Search, at: Situation, prior: SpinPrior) -> bool:
@@ -275,6 +300,12 @@ class Sizes:
     def __call__(self, theta: Float[np.ndarray, " K"]) -> Float[np.ndarray, 2]:
         """After each ball's own start, and its spin where balls spin."""
         return np.array([self._of(theta, own) for own in (self.noise, replace(self.noise, scatter=noise.ALIKE))])
+
+    def unlikely(self, theta: Float[np.ndarray, " K"], prior: SpinPrior | None) -> float:
+        """Minus the logarithm of how likely the flights are, but for a constant."""
+        prior = None if prior is None else prior.of_some(self.index)
+        cost = log_evidence(self.problem, theta, self.start, self.problem.grid, self.noise, prior, 3)[1]
+        return 0.5 * float(cost.sum())
 
     def _of(self, theta: np.ndarray, own: Noise) -> float:
         start, g = self.start.copy(), self.problem.grid

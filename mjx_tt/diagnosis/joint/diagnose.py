@@ -124,7 +124,7 @@ def _named(log: JointLog, found: JointSearch, rng: np.random.Generator) -> dict[
 
 def _causes(log: JointLog, found: JointSearch, named: Mapping[str, tuple[float, float]]) -> JointFindings:
     joint, chosen = log.record.joint, found.picked.causes
-    ends = intervals(log, found.values, found.sigma, found.model.temper) if named else {}
+    ends = intervals(log, found.values, found.sigma, found.model.temper, found.others) if named else {}
     causes, experiments = [], []
     for effect, (movement, confidence) in named.items():
         k = found.names.index(effect)

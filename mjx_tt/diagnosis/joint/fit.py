@@ -96,8 +96,13 @@ def _place(log: JointLog, values: dict[str, float], sigma: float) -> dict[str, f
     return values
 
 
-def intervals(log: JointLog, values: Values, sigma: float, temper: float) -> dict[str, tuple[float, float]]:
-    """90 % intervals of the fitted parameters from window-clustered errors, or from the noise where it says more."""
+def intervals(
+    log: JointLog, values: Values, sigma: float, temper: float, others: Float[np.ndarray, "n o"]
+) -> dict[str, tuple[float, float]]:
+    """90 % intervals of the fitted parameters from window-clustered errors, or from the noise where it says more.
+
+    others: by how much [rad], [m] what was not chosen may move the joint all the same.
+    """
     r = residual(log, values, sigma)
     weight = weights(r, sigma)
     columns = log.centred(slopes(log, values), weight)
@@ -106,12 +111,14 @@ def intervals(log: JointLog, values: Values, sigma: float, temper: float) -> dic
     count = len(scores)
     spread = bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1)
     noise = bread * sigma**2 * temper
+    hidden = bread @ columns.T @ (log.centred(others, weight) * weight[:, None])
+    variance = np.maximum(np.diagonal(spread), np.diagonal(noise)) + (hidden**2).sum(axis=1)
     result = {}
     for i, (name, value) in enumerate(values.items()):
         if not columns[:, i].any():  # any larger limit would do as well
             result[name] = (value, math.inf)
             continue
-        half = INTERVAL * math.sqrt(max(spread[i, i], noise[i, i], 0.0))
+        half = INTERVAL * math.sqrt(max(variance[i], 0.0))
         low, high = value - half, value + half
         if name == "deadband":  # the log cannot place a threshold closer than the sizes of its commands
             below, above = log.sizes[log.sizes < value], log.sizes[log.sizes >= value]

@@ -55,6 +55,12 @@ class JointSearch:
         return family.name, family.labels[largest], "+" if shape[largest] > 0.0 else "-"
 
     @property
+    def others(self) -> Float[np.ndarray, "n o"]:
+        """Movements [rad], [m] of the effects that were not chosen, all together as large as nobody would name them."""
+        rest = [k for k in range(len(self.names)) if k not in self.picked.causes]
+        return self.columns[:, rest] * self.model.spike[rest] / math.sqrt(max(len(rest), 1))
+
+    @property
     def left(self) -> float:
         """Size [rad], [m] rms of what the chosen leave, without the noise."""
         return math.sqrt(max(float(self.picked.remaining[0]) - self.level, 0.0))
