@@ -15,7 +15,6 @@ from mjx_tt.sim.actuators import EFFECTS
 from robot_io.robot_file import RobotFile
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
-COURT_BODIES = 2  # the world and the ball
 _DISABLED = ("ACTUATION", "GRAVITY", "DAMPER")
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _NEEDED_FILES = re.compile(r"<include\b|<(mesh|hfield|skin|model|texture)\b[^>]*\bfile\s*=")

@@ -129,7 +129,7 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
     context: dict[str, object] = {
         "headline": text.headline(d),
         "picture": None,
-        "sentence": text.sentence(d) if d.verdict.verdict == "none" else "",
+        "sentence": text.nothing(d) if d.verdict.verdict == "none" else "",
         "causes": [
             (_code(c.name), text.claim(c) + text.alike(c), _percent(min(c.share, 1.0)) if c.share else "", *_sure(c))
             for c in causes
@@ -149,7 +149,7 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
         context["joint_findings"] = [(u.joint, u.block, u.where, u.direction, f"{u.size:.2f}") for u in left]
     if found is not None:
         context["findings"] = [
-            (text.kind(p.name), p.direction, f"{1e3 * p.size:.1f}", f"{1e3 * p.rms:.2f}") for p in found.patterns[:8]
+            (text.block(p.name), p.direction, f"{1e3 * p.size:.1f}", f"{1e3 * p.rms:.2f}") for p in found.patterns[:8]
         ]
         if found.unexplained and any(p.name.startswith("bounce") for p in found.patterns):
             context["bounce_map"] = page.embed("bounce_map", residuals.bounce_map(found))

@@ -15,7 +15,6 @@ from mjx_tt.diagnosis.inclusion import LEAST_EVIDENCE, PRICE
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained, Verdict
 
-SUBSET = "a subset of the balls"  # block of balls of their own kind
 # Units that read better in thousandths below a size.
 DISPLAY = {
     "s": (1e3, "ms", 1.0),
@@ -94,20 +93,6 @@ def advice(steps: Sequence[Experiment]) -> tuple[str, list[str]]:
     common = shared if len(informative) > 1 else []  # one step alone says for itself what it tells
     own = [[line for line in step.separates if line not in common] for step in steps]
     return told(common), [told(lines) for lines in own]
-
-
-def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in plain words."""
-    v = diagnosis.verdict
-    if v.verdict == "none":
-        return _nothing(diagnosis)
-    if v.unexplained is not None:
-        text = f"No entry of the catalogue explains {left_over(v)}: {_odd(v.unexplained)}."
-        return " ".join([*(f"{claim(c)}{_share(c)}: named {c.name}{alike(c)}." for c in v.causes), text])
-    named = " ".join(f"{claim(c)}{_share(c)}: named {c.name}{alike(c)}." for c in v.causes)
-    if v.verdict == "undetermined":
-        return f"What was found predicts unused data worse, and is not adopted. {named}"
-    return named if len(v.causes) < 2 else f"{len(v.causes)} things are wrong. {named}"
 
 
 def claim(cause: Cause) -> str:
@@ -230,14 +215,7 @@ def _and(names: Sequence[str]) -> str:
 
 def _odd(u: Unexplained) -> str:
     along = f"mostly in {u.direction}" if u.direction in ("x", "y", "z") else f"direction {u.direction}"
-    if u.block == SUBSET:
-        return f"{u.where} fly unlike the others, {along}, by {u.size}"
     return f"{block(u.block)}, largest at {u.where}, {along}, {u.size}"
-
-
-def kind(name: str) -> str:
-    """Kind of a finding in words, for a table."""
-    return "balls that fly unlike the others" if name == SUBSET else block(name)
 
 
 def block(name: str) -> str:
@@ -269,7 +247,8 @@ def block(name: str) -> str:
     return name
 
 
-def _nothing(diagnosis: Diagnosis) -> str:
+def nothing(diagnosis: Diagnosis) -> str:
+    """What "none" says: how small an effect would have been named."""
     parts = []
     if diagnosis.balls is not None:
         found = diagnosis.balls

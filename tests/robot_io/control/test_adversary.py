@@ -23,7 +23,7 @@ OFF = ((1.3, 0.7), (0.7, 1.3))  # the arm's and the axes' delay over what the ga
 TIMEOUT = 1.0  # [s], CommTimeout as ABB ships it; the gate is told
 SILENCE = tuple(0.05 if unit == "m" else TIMEOUT for unit in JOINT_UNITS)
 NOISE = {"m": 1e-4, "rad": 2e-4}  # standard deviation of a measured position
-FAST = 0.5  # share of its limit at which a joint is blocked
+FAST, PATIENCE = 0.5, 15.0  # share of its limit at which a joint is blocked, and [s] in which that falls to nothing
 JUMP = 0.005  # [m] of blade's centre or carriage when what blocked a joint is taken away
 
 
@@ -111,13 +111,15 @@ class Attack:
                 self.recover()
 
     def moving(self, joint: int | None = None) -> bool:
-        """Runs until a ball is played and a joint, or any, is fast."""
+        """Runs until a ball is played and a joint, or any, is as fast as it gets: the gate keeps some joints slow."""
         rows = slice(None) if joint is None else joint
         limit = FAST * np.array(LIMITS.velocity)
+        begun = self.rig.now
 
         def fast():
+            wanted = limit * max(1.0 - (self.rig.now - begun) / PATIENCE, 0.05)
             return self.fault or (
-                self.rig.bridge.state is BridgeState.ACTIVE and (np.abs(self.rig.world.qvel) > limit)[rows].any()
+                self.rig.bridge.state is BridgeState.ACTIVE and (np.abs(self.rig.world.qvel) > wanted)[rows].any()
             )
 
         for _ in range(5):

@@ -166,23 +166,17 @@ def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarr
 class Projected:
     """Whitened quantities ball by ball, starts projected out. K effects and their sums with the measured target."""
 
-    weight: np.ndarray  # (n, T) square roots of the robust weights
-    noise: Noise
     gram: np.ndarray  # (n, K, K)
     right: np.ndarray  # (n, K) with the absolute target
     spin_gram: np.ndarray  # (n, 3, 3)
     spin_effect: np.ndarray  # (n, 3, K)
     spin_right: np.ndarray  # (n, 3)
-    kick_gram: np.ndarray  # (n, 3, 3) of the bounces' own kicks
-    coefficient: int | None  # the effect that comes along with spin
 
 
-def project(
-    linear: Linear, at: Situation, noise: Noise, weight: np.ndarray, g: Grid, coefficient: int | None = None
-) -> Projected:
+def project(linear: Linear, at: Situation, noise: Noise, weight: np.ndarray, g: Grid) -> Projected:
     """Whitens, projects the starts out and forms the products; the target is what the effects at zero leave."""
     target = linear.residual + np.tensordot(at.theta, linear.effects, 1)
-    return StartsOut(linear, target, at.start, noise, weight, g).project(linear.effects, coefficient)
+    return StartsOut(linear, target, at.start, noise, weight, g).project(linear.effects)
 
 
 class StartsOut:
@@ -196,10 +190,9 @@ class StartsOut:
     def __init__(
         self, linear: Linear, target: np.ndarray, start: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid
     ) -> None:
-        self._noise, self._weight, self._white = noise, weight, Whitening(noise, g)
+        self._weight, self._white = weight, Whitening(noise, g)
         free, kicks = (self._white.rows(linear.starts[part], weight) for part in (slice(6), KICK))
         self._kicks = remove(np.linalg.qr(free)[0], kicks)
-        self._kick_gram = kicks.swapaxes(1, 2) @ self._kicks
         self._scatters = bool(noise.scatter.any())
         if self._scatters:
             known = np.broadcast_to(np.eye(3), (g.n, 3, 3))
@@ -217,20 +210,16 @@ class StartsOut:
             whitened = np.concatenate([whitened, np.zeros((len(whitened), 3, whitened.shape[2]))], axis=1)
         return remove(self._basis, whitened)
 
-    def project(self, columns: np.ndarray, coefficient: int | None = None) -> Projected:
-        """The products of columns (K, 3, T, n) [m per unit]; coefficient: the one that comes along with spin."""
+    def project(self, columns: np.ndarray) -> Projected:
+        """The products of columns (K, 3, T, n) [m per unit]."""
         effects = self._left(columns)
         et, st = effects.swapaxes(1, 2), self._spins.swapaxes(1, 2)
         return Projected(
-            self._weight,
-            self._noise,
             et @ effects,
             (et @ self._target)[..., 0],
             st @ self._spins,
             st @ effects,
             (st @ self._target)[..., 0],
-            self._kick_gram,
-            coefficient,
         )
 
     def starts_beside_spins(self, linear: Linear) -> np.ndarray:

@@ -35,7 +35,6 @@ class SpinPrior:
     own_mean: Float[np.ndarray, "3 n"] | None = field(default=None, repr=False)
     own_covariance: Float[np.ndarray, "n 3 3"] | None = field(default=None, repr=False)
     components: int = 1
-    conditional: bool = False  # derivatives are taken about each ball's own spin, not about the mean of all
 
     def of_balls(self, n: int, least: float = LEAST_STD) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "n 3 3"]]:
         """Mean and precision of the spin of each of n balls. least: standard deviation that none falls below."""
@@ -170,4 +169,4 @@ def _placed(mixture: _Mixture, information: np.ndarray, score: np.ndarray) -> Sp
     weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
     own_mean, own = moments(weight / weight.sum(axis=1, keepdims=True))
     std = np.sqrt(np.diagonal(covariance))
-    return SpinPrior(mean, std, own_mean.T, own, len(mixture.share), True)
+    return SpinPrior(mean, std, own_mean.T, own, len(mixture.share))

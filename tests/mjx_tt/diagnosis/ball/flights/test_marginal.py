@@ -90,7 +90,7 @@ class Bilinear:
 
 def one_gaussian(mean: np.ndarray, spread: np.ndarray) -> SpinPrior:
     own = np.repeat(mean[:, None], BALLS, axis=1)
-    return SpinPrior(mean, spread, own, np.broadcast_to(np.diag(spread**2), (BALLS, 3, 3)), 1, True)
+    return SpinPrior(mean, spread, own, np.broadcast_to(np.diag(spread**2), (BALLS, 3, 3)))
 
 
 @pytest.fixture(scope="module")
