@@ -26,7 +26,8 @@ UNSEEN = 2.0  # evidence that a frame takes in which no camera saw it
 ROOM = np.array([[-4.0, -5.0, -0.8], [4.0, 5.0, 3.0]])  # [m] in which there are balls
 PLAY = np.array([[-1.0, -1.8, 0.0], [1.0, 2.3, 1.2]])  # [m] in which one that a single camera sees is sought
 STRIDE = 48.0  # [px] between the places where it is sought: a detector's window less the ball
-PLACES = 16  # of them, at most
+PLACES = 18  # of them, at most: a longer line has them farther apart
+SAMPLES = 256  # of a ray
 
 
 @dataclass(frozen=True)
@@ -167,11 +168,11 @@ class BallTracker:
         """Corrects a hypothesis by the place that fits best, which is free no more, or by single cameras' sights."""
         fits = sorted((self._distance(h, sight), i) for i, sight in enumerate(free))
         if fits and fits[0][0] < self.options.gate_space:
-            sight = free.pop(fits[0][1])
+            sight, fast = free.pop(fits[0][1]), h.speed > self.options.fast
             for camera, detection in zip(self.cameras, sight.detections, strict=False):
                 self._take(h, camera, detection, np.inf)
             h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
-            h.score = FADING * h.score + weigh(sight) + EXPECTED * (h.speed > self.options.fast)
+            h.score = FADING * h.score + weigh(sight) + EXPECTED * fast
             return
         h.score *= FADING
         if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
@@ -263,20 +264,18 @@ class BallTracker:
 
 
 def find_along(camera: Camera, seen: Detection, other: Camera) -> list[np.ndarray]:
-    """Pixels (2,) of another camera, STRIDE apart, at which the ball may be that a camera sees alone."""
+    """Pixels (2,) of another camera, about STRIDE apart, at which the ball may be that a camera sees alone."""
     ray = camera.rays(seen.centre[None])[0]
     with np.errstate(divide="ignore"):
         ends = np.sort((PLAY - camera.centre) / ray, axis=0)
     first, last = max(ends[0].max(), 0.0), ends[1].min()
     if first >= last:
         return []
-    line = [other.project(camera.centre + at * ray) for at in np.linspace(first, last, 64)]
-    places: list[np.ndarray] = []
-    for pixel in line:
-        inside = np.isfinite(pixel).all() and (pixel >= 0.0).all() and (pixel < other.size).all()
-        if inside and len(places) < PLACES and all(np.linalg.norm(pixel - place) >= STRIDE for place in places[-1:]):
-            places.append(pixel)
-    return places
+    line = other.project(camera.centre + np.linspace(first, last, SAMPLES)[:, None] * ray)
+    line = line[np.isfinite(line).all(axis=1) & (line >= 0.0).all(axis=1) & (line < other.size).all(axis=1)]
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+    count = min(int(np.ceil(way[-1] / STRIDE)) + 1, PLACES) if len(line) else 0
+    return list(line[np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(max=max(len(line) - 1, 0))])
 
 
 def weigh(sight: Sight) -> float:

@@ -29,6 +29,7 @@ EARLY = 2  # of them, in which no cause has to be worth its name
 PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
 STEPS = (1.0, 0.5, 0.25)  # of the way to where the linear model leads
+WORSE = 1.0  # of the logarithm of how likely the flights are, by which a step may be worse
 NO_ERROR = 1e-6  # [m^2] beside the noise, below which there is nothing to take away: a millimetre
 PRICE_OF_SPINS = 20.0  # the same of a coefficient of lift and of the nine numbers of a distribution
 SPIKE, VISIBLE = 1e-4, 1.5e-5  # [m] by which what is not chosen may be off, at a flight's end and in rms of its samples
@@ -118,12 +119,13 @@ def search(
         chosen = picked.causes
         size, covariance, _ = model.solve(chosen)
         inside = [*model.always, *chosen]
-        theta = sizes.theta(model, chosen)
+        aim = sizes.theta(model, chosen)
         begun = np.where(np.isin(np.arange(count), inside), at.theta, 0.0)
-        theta, prior = _step(sizes, begun, theta, known, prior)
+        theta, prior = _step(sizes, begun, aim, known, prior)
         say(f"round {round_ + 1}: {', '.join(problem.effects[i].name for i in inside) or 'nothing'}")
-        moved = np.abs(theta - at.theta)[inside] / np.sqrt(np.diagonal(covariance))[inside]
-        if chosen == before and round_ >= EARLY and np.max(moved, initial=0.0) < SETTLED:
+        moved = np.abs(aim - at.theta)[inside] / np.sqrt(np.diagonal(covariance))[inside]
+        stays = np.max(moved, initial=0.0) < SETTLED or np.array_equal(theta, at.theta)
+        if chosen == before and round_ >= EARLY and stays:
             break
         if round_ > EARLY and chosen in seen and chosen != before:
             break
@@ -144,16 +146,17 @@ def _step(
     known: SpinPrior | None,
     learnt: SpinPrior | None,
 ) -> tuple[Float[np.ndarray, " K"], SpinPrior | None]:
-    """Changes on the way to the linear model's, as far as they are an improvement, and the spins' distribution there.
+    """Changes on the way to the linear model's, as far as they are no loss, and the spins' distribution: its mean follows.
 
-    The linear model is right nearby only: a way that makes the flights less likely under the model itself is halved.
+    The linear model is right nearby only: a step that makes the flights less likely under the model itself is halved,
+    twice at most, and then not taken.
     """
     before = sizes.unlikely(begun, known)
     for part in STEPS:
         theta, prior = begun + part * (aim - begun), learnt
         if learnt is not None and known is not None:
             prior = learnt.moved((part - 1.0) * (learnt.mean - known.mean))
-        if sizes.unlikely(theta, prior) < before + SETTLED:
+        if sizes.unlikely(theta, prior) < before + WORSE:
             return theta, prior
     return begun, known
 

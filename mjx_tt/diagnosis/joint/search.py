@@ -57,7 +57,7 @@ class JointSearch:
     @property
     def others(self) -> Float[np.ndarray, "n o"]:
         """Movements [rad], [m] of the effects that were not chosen, all together as large as nobody would name them."""
-        rest = [k for k in range(len(self.names)) if k not in self.picked.causes]
+        rest = [k for k in range(len(self.names)) if k not in self.picked.causes and self.columns[:, k].any()]
         return self.columns[:, rest] * self.model.spike[rest] / math.sqrt(max(len(rest), 1))
 
     @property

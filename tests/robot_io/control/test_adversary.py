@@ -114,7 +114,6 @@ class Attack:
         """Runs until a ball is played and a joint, or any, is as fast as it gets: the gate keeps some joints slow."""
         rows = slice(None) if joint is None else joint
         limit = FAST * np.array(LIMITS.velocity)
-        begun = self.rig.now
 
         def fast():
             wanted = limit * max(1.0 - (self.rig.now - begun) / PATIENCE, 0.05)
@@ -123,6 +122,7 @@ class Attack:
             )
 
         for _ in range(5):
+            begun = self.rig.now
             self.run(20.0, fast)
             if not self.fault:
                 return True

@@ -132,16 +132,19 @@ def test_guesses_lie_where_the_ball_will_be():
 
 @pytest.mark.parametrize("blind", [0, 1])
 def test_what_one_camera_sees_alone_is_sought_along_its_ray_by_the_other(blind):
-    places, velocities = fly()
-    rng, tracker = np.random.default_rng(5), BallTracker(CAMERAS)
-    seen = [[detect(c, places[100], velocities[100], rng)] for c in CAMERAS]
-    seen[blind] = []
-    assert tracker.update(0.0, seen) is None
-    guesses = tracker.guesses(PERIOD)
-    assert not guesses[1 - blind]
-    # Half of a window reaches 32 px to each side, and the ball flew on for a period.
-    ball = CAMERAS[blind].project(places[108])
-    assert min(np.abs(guess - ball).max() for guess in guesses[blind]) < 32.0 - 3.0
+    rng = np.random.default_rng(5)
+    places = rng.uniform([-0.95, -1.7, 0.05], [0.95, 2.2, 1.1], (100, 3))
+    places = [place for place in places if all(camera.sees(place, 5.0) for camera in CAMERAS)]
+    assert len(places) > 60
+    for place in places:
+        seen = [[detect(c, place, np.zeros(3), rng)] for c in CAMERAS]
+        seen[blind], tracker = [], BallTracker(CAMERAS)
+        assert tracker.update(0.0, seen) is None
+        guesses = tracker.guesses(PERIOD)
+        assert not guesses[1 - blind]
+        # Half of a window reaches 32 px to each side.
+        ball = CAMERAS[blind].project(place)
+        assert min(np.abs(guess - ball).max() for guess in guesses[blind]) < 32.0
 
 
 def test_a_ball_that_is_unsure_everywhere_but_where_it_was_expected_is_believed():
