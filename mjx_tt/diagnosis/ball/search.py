@@ -146,7 +146,7 @@ def _step(
     known: SpinPrior | None,
     learnt: SpinPrior | None,
 ) -> tuple[Float[np.ndarray, " K"], SpinPrior | None]:
-    """Changes on the way to the linear model's, as far as they are no loss, and the spins' distribution: its mean follows.
+    """Changes on the way to the linear model's, as far as they are no loss, and the spins' distribution, moved alike.
 
     The linear model is right nearby only: a step that makes the flights less likely under the model itself is halved,
     twice at most, and then not taken.
