@@ -16,9 +16,9 @@ from robot_io.errors import DeviceError
 from robot_io.vision.camera import Camera
 from robot_io.vision.detection import Detection
 from robot_io.vision.sources import Source
+from robot_io.vision.tracker import GUESSES
 
 RING = 8  # frames in shared memory: those that the detector compares, and those that are looked at outside
-GUESSES = 20  # places that a camera is told
 START_TIME = 20.0  # [s]
 
 

@@ -28,6 +28,7 @@ PLAY = np.array([[-1.0, -1.8, 0.0], [1.0, 2.3, 1.2]])  # [m] in which one that a
 STRIDE = 48.0  # [px] between the places where it is sought: a detector's window less the ball
 PLACES = 18  # of them, at most: a longer line has them farther apart
 SAMPLES = 256  # of a ray
+GUESSES = 2 + PLACES  # for a camera, at most: of two hypotheses, and along a ray
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,9 @@ class BallTracker:
         ahead = [h.at(time)[:3] for h in self.hypotheses[:2]]
         pixels = [[camera.project(point) for point in ahead] for camera in self.cameras]
         if self.reported is None:
-            for seen, camera, row in zip(self.alone, self.cameras[:2], pixels[1::-1], strict=False):
-                other = self.cameras[1] if camera is self.cameras[0] else self.cameras[0]
+            for seen, camera, other, row in zip(
+                self.alone, self.cameras[:2], self.cameras[1::-1], pixels[1::-1], strict=False
+            ):
                 row += [] if seen is None else find_along(camera, seen, other)
         return [[p for p in row if np.isfinite(p).all()] for row in pixels]
 
@@ -174,17 +176,14 @@ class BallTracker:
             h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
             h.score = FADING * h.score + weigh(sight) + EXPECTED * fast
             return
-        h.score *= FADING
-        if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
-            h.score -= UNSEEN
-            return  # both cameras see it elsewhere
-        for camera, seen in zip(self.cameras, detections, strict=True):
-            near = [(self._misfit(h, camera, d), i) for i, d in enumerate(seen)]
-            if near and min(near)[0] < self.options.gate:
-                self._take(h, camera, seen[min(near)[1]], self.options.gate)
-                h.seen = h.time
-        if h.seen < h.time:
-            h.score -= UNSEEN
+        # Where both cameras see it elsewhere, what one of them sees is none of it.
+        if not any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
+            for camera, seen in zip(self.cameras, detections, strict=True):
+                near = [(self._misfit(h, camera, d), i) for i, d in enumerate(seen)]
+                if near and min(near)[0] < self.options.gate:
+                    self._take(h, camera, seen[min(near)[1]], self.options.gate)
+                    h.seen = h.time
+        h.score = FADING * h.score - UNSEEN * (h.seen < h.time)
 
     def _distance(self, h: Hypothesis, sight: Sight) -> float:
         r = sight.point - h.ball.mean[:3]
@@ -273,9 +272,11 @@ def find_along(camera: Camera, seen: Detection, other: Camera) -> list[np.ndarra
         return []
     line = other.project(camera.centre + np.linspace(first, last, SAMPLES)[:, None] * ray)
     line = line[np.isfinite(line).all(axis=1) & (line >= 0.0).all(axis=1) & (line < other.size).all(axis=1)]
+    if not len(line):
+        return []
     way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    count = min(int(np.ceil(way[-1] / STRIDE)) + 1, PLACES) if len(line) else 0
-    return list(line[np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(max=max(len(line) - 1, 0))])
+    count = min(int(np.ceil(way[-1] / STRIDE)) + 1, PLACES)
+    return list(line[np.searchsorted(way, np.linspace(0.0, way[-1], count))])
 
 
 def weigh(sight: Sight) -> float:
