@@ -1,4 +1,4 @@
-"""Figures of a verdict: how the causes were weighed, how large they are, and what they gain."""
+"""Figures of a verdict: how large the causes are, what they gain, how balls spin, what was taken out of the tracks."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from scipy.special import bdtr
 
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
+from mjx_tt.diagnosis.ball.spins import Spins
 from mjx_tt.diagnosis.hits.diagnose import HitFindings
 from mjx_tt.diagnosis.joint import JointFindings
 from mjx_tt.diagnosis.report.residuals import AFTER, AXES, BEFORE, MEANING, UNCHANGED, usual
+from mjx_tt.diagnosis.tracks import Record
+from mjx_tt.diagnosis.tracks.clean import KINDS, MEANINGS
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import FAINT, INK, STYLE, WIDTH
 
+MOST_TRACKS = 150  # drawn behind what was taken out, spread over the log
+COLOURS = matplotlib.colormaps["tab10"]
 FAR = 12.0  # times the smallest, beyond which the largest of several sizes makes the scale logarithmic
 
 
@@ -223,4 +228,56 @@ def play(rates: Sequence[tuple[str, float, float, float]]) -> Figure:
         ax.set_xlim(max(0.0, every.min() - 5.0), min(100.5, every.max() + 5.0))
         ax.tick_params(axis="y", length=0)
         ax.set_xlabel("balls returned [%]")
+    return figure
+
+
+def taken_out(record: Record) -> Figure:
+    """Samples that were taken out, over the tracks they came from."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
+        views = figure.subplots(1, 2)
+    for ax, (i, j), labels in zip(views, ((1, 2), (1, 0)), (("y [m]", "z [m]"), ("y [m]", "x [m]")), strict=True):
+        for t in record.tracks[:: max(len(record.tracks) // MOST_TRACKS, 1)]:
+            ax.plot(t.position[i], t.position[j], color=FAINT, lw=0.5, alpha=0.5)
+        for kind in KINDS:
+            found = [e for e in record.of(kind) if e.samples]
+            for k, entry in enumerate(found):
+                label = MEANINGS[kind].partition(";")[0] if k == 0 else None
+                colour = COLOURS(KINDS.index(kind) % COLOURS.N)
+                ax.plot(entry.position[i], entry.position[j], ".", ms=3.5, color=colour, label=label)
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+    if any(e.samples for e in record.entries):
+        figure.legend(*views[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    return figure
+
+
+def spins(found: Spins) -> Figure:
+    """Spins about x against z and against y with one standard deviation, and the distribution of their size."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+        plots = figure.subplots(1, 3)
+    for ax, axis in zip(plots[:2], (2, 1), strict=True):
+        # A few wild balls, beyond the usual by far, do not press the rest together.
+        for k, limits in ((0, ax.set_xlim), (axis, ax.set_ylim)):
+            low, high = usual(found.mean[k])
+            margin = 0.3 * (high - low) + 2.0 * np.median(found.std[k])
+            limits(min(low - margin, 0.0), max(high + margin, 0.0))
+        ax.errorbar(
+            found.mean[0],
+            found.mean[axis],
+            xerr=found.std[0],
+            yerr=found.std[axis],
+            fmt=".",
+            ms=4,
+            lw=0.5,
+            color=AFTER,
+            alpha=0.6,
+        )
+        ax.axhline(0.0, color=INK, lw=0.6)
+        ax.axvline(0.0, color=INK, lw=0.6)
+        ax.set(xlabel="spin about x [rad/s]", ylabel=f"spin about {'xyz'[axis]} [rad/s]")
+    size = np.linalg.norm(found.mean, axis=0)
+    most = 1.3 * usual(size)[1]
+    plots[2].hist(np.minimum(size, most), bins=min(30, max(len(size) // 6, 5)), color=AFTER, alpha=0.7)
+    plots[2].set(xlabel="size of the spin [rad/s]", ylabel="balls")
     return figure

@@ -22,7 +22,7 @@ from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
 from mjx_tt.diagnosis.inclusion import LEAST_SHARE
-from mjx_tt.diagnosis.report import cleaning, figures, headline, residuals, spins, text
+from mjx_tt.diagnosis.report import figures, headline, residuals, text
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
 
@@ -354,13 +354,12 @@ def _spins(d: Diagnosis, page: Page) -> Context:
     found = d.balls
     if found is None or found.spins is None:
         return None
-    context: dict[str, object] = {"picture": None}
-    if found.spins is not None:
-        context["picture"] = page.embed("spins", spins.spins(found.spins))
-        context["balls"] = len(found.spins.name)
-        context["size"] = f"{np.median(np.linalg.norm(found.spins.mean, axis=0)):.0f}"
-        context["deviation"] = f"{np.median(found.spins.std):.1f}"
-    return context
+    return {
+        "picture": page.embed("spins", figures.spins(found.spins)),
+        "balls": len(found.spins.name),
+        "size": f"{np.median(np.linalg.norm(found.spins.mean, axis=0)):.0f}",
+        "deviation": f"{np.median(found.spins.std):.1f}",
+    }
 
 
 def _cleaned(d: Diagnosis, page: Page) -> Context:
@@ -369,7 +368,7 @@ def _cleaned(d: Diagnosis, page: Page) -> Context:
     taken = any(e.samples for e in d.record.entries)
     return {
         "lines": d.record.lines(),
-        "picture": page.embed("taken_out", cleaning.taken_out(d.record)) if taken else None,
+        "picture": page.embed("taken_out", figures.taken_out(d.record)) if taken else None,
         "entries": [str(e) for e in d.record.entries],
     }
 
