@@ -177,9 +177,10 @@ def attack(seeds, stalls: int, blocks: int, seconds: float) -> list[Attack]:
         one = Attack(seed)
         for _ in range(stalls):
             one.stall()
-        for i in range(blocks):
-            found, jump = one.block((seed * blocks + i) % 8)
-            assert not found or jump < JUMP, (seed, i, jump)
+        blocked = [one.block((seed * blocks + i) % 8) for i in range(blocks)]
+        # A joint that turns back by itself in time is no fault; most do not.
+        assert sum(found for found, _ in blocked) >= blocks // 2, (seed, blocked)
+        assert max((jump for _, jump in blocked), default=0.0) < JUMP, (seed, blocked)
         one.play(seconds)
         attacks.append(one)
         print(f"seed {seed}: {one.rig.now:.0f} s, {one.faults} faults, {one.trips} trips, {one.contacts} contacts")
