@@ -15,7 +15,7 @@ from mjx_tt.diagnosis.ball.diagnose import BallFindings, jitter_cause
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights import tracker_gate
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS
-from mjx_tt.diagnosis.ball.search import NO_ERROR, Sizes
+from mjx_tt.diagnosis.ball.search import NO_ERROR
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Left, Part, Together, Unexplained
 from mjx_tt.sim import model as models
 from mjx_tt.sim.randomisation import Samples
@@ -69,19 +69,8 @@ def part(
         _together(found),
         _samples(found, seed) if named else (),
         held_out.low > 0.0,
-        _left(found),
+        Left(1e3 * found.left, (found.left / max(found.whole, NO_ERROR)) ** 2, 1e3 * found.whole),
     )
-
-
-def _left(found: BallFindings) -> Left:
-    """What the extended model leaves, bounces all alike."""
-    search = found.search
-    rest = search.picked.remaining
-    if found.companions:
-        sizes = Sizes(found.problem, search.at, search.noise, search.prior)
-        rest = sizes(sizes.theta(search.model, (*search.chosen, *found.companions)))
-    left, whole = (max(x[1] - search.level, 1e-12) for x in (rest, search.picked.errors))
-    return Left(1e3 * float(np.sqrt(left)), float(left / whole), 1e3 * float(np.sqrt(whole)))
 
 
 def _where(found: BallFindings, name: str) -> str:

@@ -16,7 +16,7 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.noise import Jitter
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
-from mjx_tt.diagnosis.ball.search import Search, Sessions, mean_square, search, spins_pay
+from mjx_tt.diagnosis.ball.search import Search, Sessions, after_starts, mean_square, search, spins_pay
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
 from mjx_tt.diagnosis.inclusion import LEAST_LEFT_SHARE, Set
 from mjx_tt.diagnosis.logs import before_racket
@@ -51,6 +51,8 @@ class BallFindings:
     confidence: dict[int, float]  # share of half logs that choose it
     left_out: Set  # effects that were no candidates
     patterns: tuple[Pattern, ...]  # the largest first
+    left: float  # [m] root mean square of all of them
+    whole: float  # [m] the same of the nominal model's error, without the noise
     unexplained: bool  # the patterns are a fifth of the error, and large enough to matter
     residual0: Float[np.ndarray, "3 T n"]  # [m] under the nominal model
     start0: Float[np.ndarray, "12 n"]
@@ -121,8 +123,8 @@ def diagnose_balls(
     found = search(problem, at, spun, left_out, sessions, error, say)
     patterns, largest, rms = _patterns(found, g)
     # Bounces count with what differs between them: a place that returns balls otherwise is no scatter.
-    whole = max(start_error - found.level, rms**2)
-    unexplained = largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * whole
+    whole = float(np.sqrt(max(start_error - found.level, rms**2)))
+    unexplained = largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * whole**2
     may_spin = largest >= LEAST_LEFT
     if spin == "none" and not may_spin:
         say("asking whether balls spin, each in its own way")
@@ -140,6 +142,8 @@ def diagnose_balls(
         found.model.confidence(found.chosen, rng),
         left_out,
         patterns,
+        rms,
+        whole,
         unexplained,
         residual0,
         nominal.start,
@@ -173,14 +177,13 @@ def _with_filter(problem: BallProblem, at: Situation, gone: set[str]) -> tuple[B
 
 def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float]:
     """What the discrepancy is made of, the size [m] of all of it on one ball in ten, and its rms [m]."""
-    free = np.where(g.mask, found.linear.starts[:6], 0.0)
-    basis = np.linalg.qr(np.moveaxis(free.reshape(6, -1, g.n), (0, 1, 2), (2, 1, 0)))[0]
+    left = found.picked.left
 
     def sizes(columns: np.ndarray) -> tuple[float, float]:
-        shown = np.where(g.mask, np.tensordot(found.picked.left.coefficients[columns], found.columns[columns], 1), 0.0)
-        rows = shown.reshape(-1, g.n).T[..., None]
-        rows = (rows - basis @ (basis.swapaxes(1, 2) @ rows)).reshape(g.n, 3, -1)
-        square = (rows**2).sum(axis=1)
+        smooth = np.where(np.isin(np.arange(len(found.columns)), columns), left.coefficients, 0.0)
+        beyond = found.model.beyond(found.chosen, smooth)
+        shown = np.tensordot(beyond, found.columns, 1)[None]
+        square = (after_starts(shown, found.linear, g).reshape(g.n, 3, -1) ** 2).sum(axis=1)
         return float(np.percentile(np.sqrt(square.max(axis=1)), 90)), float(np.sqrt(square.sum() / g.mask.sum()))
 
     families = [f for f in found.model.families if found.picked.left.coefficients[f.columns].any()]

@@ -18,16 +18,17 @@ from mjx_tt.diagnosis.ball.effects import FLIGHT, TABLE
 from mjx_tt.diagnosis.ball.flights import marginal, noise
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts, log_evidence, of_some, refit_worst
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem, Linear, Situation, shifts
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem, Linear, Situation, remove, shifts
 from mjx_tt.diagnosis.ball.flights.noise import Noise, Whitening
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 from mjx_tt.diagnosis.inclusion import Chosen, Family, Left, LinearModel, Set, choose
 from mjx_tt.diagnosis.robust import bounded_mean
 
-ROUNDS = 8
+ROUNDS = 12
 EARLY = 2  # of them, in which no cause has to be worth its name
 PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
+LEAST_GAIN = 0.1  # of the logarithm of how likely the flights are, that a step must bring
 STEPS = (1.0, 0.5, 0.25)  # of the way to where the linear model leads
 WORSE = 1.0  # of the logarithm of how likely the flights are, by which a step may be worse
 NO_ERROR = 1e-6  # [m^2] beside the noise, below which there is nothing to take away: a millimetre
@@ -92,9 +93,10 @@ def search(
     )
     before: Set = ()
     own = noise.nominal_noise(g)
+    held: Set = ()  # causes of what else would be unexplained
     scatter, seen, unknowns = SCATTER, set[Set](), 6 if prior is None else 9
     for round_ in range(ROUNDS):
-        linear = problem.linearise(at)
+        linear = problem.linearise(at, across=True)
         families, smooth = discrepancy.build(linear, g, sessions.number, sessions.age, sessions.names, count)
         columns = np.concatenate([linear.effects, smooth])
         shift, spin_shift = shifts(linear, g, problem.effects)
@@ -115,26 +117,35 @@ def search(
             own = replace(noise.estimate(left, frame, g, unknowns), scatter=scatter)
         sizes = Sizes(problem, at, own, prior)
         level = sizes.of(left, unknowns)
-        picked = choose(model, partial(sizes.beside, model), before, error, level, NO_ERROR, round_ < EARLY)
-        chosen = picked.causes
+        beside = model.holding(held)
+        picked = choose(beside, partial(sizes.beside, beside), before, error, level, NO_ERROR, round_ < EARLY)
+        chosen = (*picked.causes, *held)
         size, covariance, _ = model.solve(chosen)
         inside = [*model.always, *chosen]
         aim = sizes.theta(model, chosen)
         begun = np.where(np.isin(np.arange(count), inside), at.theta, 0.0)
-        theta, prior = _step(sizes, begun, aim, known, prior)
+        theta, prior, gain = _step(sizes, begun, aim, known, prior)
         say(f"round {round_ + 1}: {', '.join(problem.effects[i].name for i in inside) or 'nothing'}")
         moved = np.abs(aim - at.theta)[inside] / np.sqrt(np.diagonal(covariance))[inside]
-        stays = np.max(moved, initial=0.0) < SETTLED or np.array_equal(theta, at.theta)
-        if chosen == before and round_ >= EARLY and stays:
-            break
-        if round_ > EARLY and chosen in seen and chosen != before:
-            break
-        seen.add(chosen)
-        before = chosen
+        stays = np.max(moved, initial=0.0) < SETTLED or gain < LEAST_GAIN
+        again = picked.causes in seen and picked.causes != before
+        if round_ >= EARLY and ((picked.causes == before and stays) or again):
+            rows = after_starts(columns, linear, g)
+            square = np.einsum("nrc,nrd->cd", rows, rows, optimize=True) / g.mask.sum()
+            whole = float(np.max(picked.errors)) - level
+            more = model.catalogued(chosen, picked.left, square, whole, NO_ERROR)
+            if not more:
+                break
+            held, seen = (*held, *more), set()
+        seen.add(picked.causes)
+        before = picked.causes
         start = fit_starts(problem, theta, at.start, g, own, prior, rounds=4)
         if prior is not None:
             start = refit_worst(problem, theta, start, g, own, prior)
         at = Situation(theta, start)
+    if held:
+        without = {j: sizes.beside(model, tuple(c for c in chosen if c != j)) for j in chosen}
+        picked = replace(picked, causes=tuple(sorted(chosen)), without=without)
     level = sizes.of(left, unknowns)
     return Search(at, linear, own, prior, model, columns, picked, shift, spin_shift, level)
 
@@ -145,8 +156,9 @@ def _step(
     aim: Float[np.ndarray, " K"],
     known: SpinPrior | None,
     learnt: SpinPrior | None,
-) -> tuple[Float[np.ndarray, " K"], SpinPrior | None]:
-    """Changes on the way to the linear model's, as far as they are no loss, and the spins' distribution, moved alike.
+) -> tuple[Float[np.ndarray, " K"], SpinPrior | None, float]:
+    """Changes on the way to the linear model's, as far as they are no loss, the spins' distribution, moved alike, and
+    how much likelier they make the flights.
 
     The linear model is right nearby only: a step that makes the flights less likely under the model itself is halved,
     twice at most, and then not taken.
@@ -156,9 +168,9 @@ def _step(
         theta, prior = begun + part * (aim - begun), learnt
         if learnt is not None and known is not None:
             prior = learnt.moved((part - 1.0) * (learnt.mean - known.mean))
-        if sizes.unlikely(theta, prior) < before + WORSE:
-            return theta, prior
-    return begun, known
+        if (after := sizes.unlikely(theta, prior)) < before + WORSE:
+            return theta, prior, before - after
+    return begun, known, 0.0
 
 
 def spins_pay(problem: BallProblem, plain: Search, at: Situation, prior: SpinPrior) -> bool:
@@ -199,7 +211,7 @@ def _linear_model(
         more = marginal.growth(problem, flights, linear, at, physical)
     # What is wrong with all bounces would pass for bounces that scatter, and with all flights for spin: how spins and
     # kicks are distributed is asked of what effects and discrepancy together leave.
-    theta, everything = np.pad(at.theta, (0, len(columns) - k)), Left(np.zeros(0), 0.0, 0.0)
+    theta, everything = np.pad(at.theta, (0, len(columns) - k)), Left(np.zeros(0), np.zeros(0), 0.0, 0.0)
     for _ in range(PASSES):
         prior, scatter = marginal.distributions(products, theta, prior, own.scatter)
         own = replace(own, scatter=scatter)
@@ -321,6 +333,15 @@ class Sizes:
     def of(self, left: Float[np.ndarray, "3 T n"], unknowns: int) -> float:
         """Of residuals of all balls."""
         return mean_square(left[..., self.index], self.problem.grid, unknowns)
+
+
+def after_starts(columns: Float[np.ndarray, "c 3 T n"], linear: Linear, g: Grid) -> Float[np.ndarray, "n s c"]:
+    """Columns [m] of each ball's samples, less what its own start takes of them."""
+
+    def rows(x: np.ndarray) -> np.ndarray:
+        return np.moveaxis(np.where(g.mask, x, 0.0).reshape(len(x), -1, g.n), (0, 1, 2), (2, 1, 0))
+
+    return remove(np.linalg.qr(rows(linear.starts[:6]))[0], rows(columns))
 
 
 def mean_square(left: Float[np.ndarray, "3 T n"], g: Grid, unknowns: int) -> float:

@@ -284,6 +284,12 @@ def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin
     # Seen when flights before the bounce alone are fitted: 0.30 to 0.33, not 0.47. The balls fly one way at one speed.
     assert cause.name == "drag_coefficient" and cause.share > 0.8 and found.verdict.held_out.low > 0.0
     assert 0.28 < drag.estimate < 0.33
+    # Fits of the flights before and after the bounce, each for itself, with drag alone: the table returns 0.890 of the
+    # vertical speed and takes 0.449 of the speed along it, more than a ball without spin loses that only grips.
+    named = {c.name: c.parameters for c in found.verdict.causes}
+    assert found.verdict.verdict == "named" and found.verdict.left.share < 0.2
+    assert named["table_restitution"]["ball.table.restitution"].estimate == pytest.approx(0.890, abs=0.016)
+    assert named["table_grip"]["ball.table.tangential_restitution"].low > 0.0
     # No camera is turned by 34 mrad and no table is 25 mm lower: both were named and adopted once.
     sensing = replace(found.extended.model.sensing, jitter=SimModel().sensing.jitter)
     assert sensing == SimModel().sensing and found.extended.model.ball.table.height == 0.0
