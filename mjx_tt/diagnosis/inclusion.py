@@ -172,7 +172,7 @@ class LinearModel:
             mixed = gram[np.ix_(pair, beside)]
             alone = alone - mixed @ np.linalg.solve(gram[np.ix_(beside, beside)], mixed.T)
         cosine = np.abs(alone[0]) / np.sqrt(np.maximum(alone[0, 0] * np.diagonal(alone), 1e-300))
-        same = (evidence[0] - evidence[1:] < TIE) | (cosine[1:] > ALIKE)
+        same = (evidence[1:] > evidence[0] - TIE) | (cosine[1:] > ALIKE)
         return (member, *(c for c, alike in zip(others, same, strict=True) if alike))
 
     def confidence(self, chosen: Set, rng: np.random.Generator) -> dict[int, float]:
