@@ -54,7 +54,7 @@ class Drive:
         self.homed = False
         self.homing = False
         self.task = False  # a positioning task is active
-        self.paused = False
+        self.paused = False  # brakes and keeps the task
         self.target = 0.0
         self.origin: float | None = None  # the plant's position that is reported as 0
         self.x = self.v = 0.0  # generated
@@ -71,6 +71,11 @@ class Drive:
     @property
     def operating(self) -> bool:
         return self.power is Power.OPERATING
+
+    @property
+    def powered(self) -> bool:
+        """It has power, be it that it brakes to switch off."""
+        return self.power in (Power.OPERATING, Power.SWITCHING_OFF)
 
     @property
     def reached(self) -> bool:
@@ -108,9 +113,6 @@ class Drive:
         self._until = self._now + self.params.homing_time
         return True
 
-    def abort_homing(self) -> None:
-        self.homing = False
-
     def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> bool:
         """A positioning task (reported coordinate); False if refused: not operating, homing, absolute and not homed."""
         if not self.operating or self.homing or not (self.homed or relative) or acceleration <= 0.0:
@@ -127,19 +129,12 @@ class Drive:
             self._restart(self._position, self._velocity)
         self.task = False
 
-    def pause(self) -> None:
-        """Brakes and keeps the task until ``resume``."""
-        self.paused = True
-
-    def resume(self) -> None:
-        self.paused = False
-
     def measure(self, position: float, velocity: float) -> None:
         """Position and velocity of the plant, at which the generator starts when the drive gets power."""
         self._position, self._velocity = position, velocity
         if self.origin is None:
             self.origin = position
-        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+        if not self.powered:
             self.x, self.v = position, 0.0
 
     def step(self, now: float) -> None:
@@ -151,7 +146,7 @@ class Drive:
             self.power = Power.OPERATING
         if self.power is Power.OPERATING and self.task and not self.paused:
             self.x, self.v = advance(self.x, self.v, self.target, self._speed, self.acceleration, dt)
-        elif self.power in (Power.OPERATING, Power.SWITCHING_OFF):
+        elif self.powered:
             self.x, self.v = brake(self.x, self.v, self.params.acceleration, dt)
         if self.power is Power.SWITCHING_OFF and self.v == 0.0:
             self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED
@@ -172,7 +167,7 @@ class Drive:
         if window > 0.0:
             earlier, area = self._past.at(self._now - window)
             x, v = (self._area - area) / window, (self.x - earlier) / window
-        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+        if not self.powered:
             return 0.0
         error = x - self._position
         if abs(error) > self.params.following_error:
@@ -189,7 +184,7 @@ class Drive:
 
     def _switch_off(self) -> None:
         self.task = self.homing = False
-        if self.power in (Power.OPERATING, Power.SWITCHING_OFF) and self.v != 0.0:
+        if self.powered and self.v != 0.0:
             self.power = Power.SWITCHING_OFF
         elif self.power is not Power.INHIBITED:
             self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED

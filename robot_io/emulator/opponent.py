@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -35,34 +36,39 @@ class Throws:
             )
 
 
-def at_home(world: World) -> bool:
-    """True when the robot stands at its home pose."""
-    return bool((np.abs(world.qpos - world.home) < NEAR_HOME).all() and (np.abs(world.qvel) < STILL).all())
+class Quiet:
+    """Waits until the robot has stood at its home pose, with no ball in play, for ``pause`` [s]."""
+
+    def __init__(self, pause: float) -> None:
+        self._pause, self._since = pause, math.inf
+
+    def lasted(self, world: World, now: float) -> bool:
+        """One look at ``now`` [s]; True when it was quiet for so long, which then begins anew."""
+        away, moving = np.abs(world.qpos - world.home) >= NEAR_HOME, np.abs(world.qvel) >= STILL
+        self._since = math.inf if world.in_play or away.any() or moving.any() else min(self._since, now)
+        if self._since == math.inf or now - self._since < self._pause:
+            return False
+        self._since = math.inf
+        return True
 
 
 class Thrower:
-    """Throws one ball after the other, from the start again when all are thrown.
+    """Throws one ball after the other, from number ``first`` and from the start again when all are thrown.
 
     pause  [s] that robot and ball must have been still
     """
 
     def __init__(self, throws: Throws, pause: float = 0.6, first: int = 0) -> None:
-        self._throws, self._pause, self._next = throws, pause, first
-        self._quiet_since: float | None = None
+        self._throws, self._quiet, self._next = throws, Quiet(pause), first
         self.thrown = 0
 
     def update(self, world: World, now: float) -> bool:
         """Throws when it is time; True when it did."""
-        if world.in_play or not at_home(world):
-            self._quiet_since = None
-            return False
-        if self._quiet_since is None:
-            self._quiet_since = now
-        if now - self._quiet_since < self._pause:
+        if not self._quiet.lasted(world, now):
             return False
         i = self._next % self._throws.position.shape[1]
         world.throw(self._throws.position[:, i], self._throws.velocity[:, i], self._throws.spin[:, i])
-        self._next, self.thrown, self._quiet_since = i + 1, self.thrown + 1, None
+        self._next, self.thrown = i + 1, self.thrown + 1
         return True
 
 
@@ -124,7 +130,7 @@ class Rallies:
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
         self._state = self._waiting
-        self._since: float | None = None
+        self._quiet = Quiet(self.pause)
         self._next_at = 0.0
         self._hit_at = self._struck_at = 0.0
         self._wish = (0.0, 0.0)
@@ -134,16 +140,8 @@ class Rallies:
         return self._state(world, world.time)
 
     def _waiting(self, world: World, now: float) -> bool:
-        if self.patient:
-            if world.in_play or not at_home(world):
-                self._since = None
-                return False
-            self._since = now if self._since is None else self._since
-            if now - self._since < self.pause:
-                return False
-        elif now < self._next_at:
+        if not (self._quiet.lasted(world, now) if self.patient else now >= self._next_at):
             return False
-        self._since = None
         ball = self.opponent.serve()
         world.throw(ball.position, ball.velocity, ball.spin)
         self.thrown += 1

@@ -89,25 +89,21 @@ class World:
         self._ball_geom, self._paddle_geom = self.model.geom("ball").id, self.model.geom("rig_paddle").id
         self._site = self.model.site("paddle").id
         self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in contract.joints]].copy()
-        self.in_play = False
-        self.number = self.strokes = 0  # of the ball in play, of the human
-        self._touching: set[int] = set()  # geoms
-        self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
         self._surfaces = {
             self.model.geom("col_table").id: (self.params.table_restitution, self.params.table_friction),
             self.model.geom("net").id: NET,
         }
-        self.held: np.ndarray | None = None  # [m] where a hand holds the ball
-        self.on_blade = False  # the ball is clipped to the blade
-        self.collisions = 0  # steps in which robot and table touched
         self.reset()
 
     def reset(self) -> None:
         """Robot at home and at rest, ball away, time zero."""
         mujoco.mj_resetData(self.model, self.data)
-        self.number = self.strokes = 0
-        self.collisions, self.touches, self._touching = 0, [], set()
-        self.held, self.on_blade = None, False
+        self.number = self.strokes = 0  # of the ball in play, of the human
+        self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
+        self._touching: set[int] = set()  # geoms
+        self.collisions = 0  # steps in which robot and table touched
+        self.held: np.ndarray | None = None  # [m] where a hand holds the ball
+        self.on_blade = False  # the ball is clipped to the blade
         self.data.qpos[self._q] = self.home
         self.park()
         mujoco.mj_forward(self.model, self.data)
@@ -148,15 +144,16 @@ class World:
 
     def throw(self, position: Vector, velocity: Vector, spin: Vector = (0.0, 0.0, 0.0)) -> None:
         """Puts a new ball into play."""
-        self._place(position, velocity, spin)
-        mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
-        self.in_play, self._touching, self.touches = True, set(), []
-        self.number, self.strokes = self.number + 1, self.strokes + 1
+        self.number, self.in_play = self.number + 1, True
+        self._start(position, velocity, spin)
 
     def strike(self, velocity: Vector, spin: Vector) -> None:
         """Gives the ball in play another velocity and spin, where it is."""
-        self._place(self.ball, velocity, spin)
-        mujoco.mj_kinematics(self.model, self.data)
+        self._start(self.ball, velocity, spin)
+
+    def _start(self, position: Vector, velocity: Vector, spin: Vector) -> None:
+        self._place(position, velocity, spin)
+        mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
         self._touching, self.touches = set(), []
         self.strokes += 1
 
@@ -177,12 +174,11 @@ class World:
         whole: the linear axes as well, which are pushed by hand, without power.
         """
         joints = slice(None) if whole else self._arm
-        self.data.qpos[self._q[joints]], self.data.qvel[self._v[joints]] = self.home[joints], 0.0
-        mujoco.mj_forward(self.model, self.data)
+        self.hold(joints, self.home[joints])
 
-    def hold(self, joint: int, place: float) -> None:
-        """Puts a joint to a place, at rest: an obstacle is there."""
-        self.data.qpos[self._q[joint]], self.data.qvel[self._v[joint]] = place, 0.0
+    def hold(self, joints: int | slice | list[int], place: float | np.ndarray) -> None:
+        """Puts joints to a place, at rest: an obstacle is there."""
+        self.data.qpos[self._q[joints]], self.data.qvel[self._v[joints]] = place, 0.0
         mujoco.mj_forward(self.model, self.data)
 
     def park(self) -> None:
@@ -240,8 +236,7 @@ class World:
                 velocity = data.qvel[v : v + 3]
                 acceleration = -self.params.drag * np.sqrt(velocity @ velocity) * velocity
                 if self.params.magnus:  # a free joint's angular velocity is in the body's frame
-                    spin = data.xmat[self._ball_body].reshape(3, 3) @ data.qvel[v + 3 : v + 6]
-                    acceleration += self.params.magnus * np.cross(spin, velocity)
+                    acceleration += self.params.magnus * np.cross(self.ball_spin, velocity)
                 data.xfrc_applied[self._ball_body, :3] = BALL_MASS * acceleration
             before = data.qvel[v : v + 3].copy()
             mujoco.mj_step(self.model, data)
@@ -277,8 +272,7 @@ class World:
             motion = np.zeros(6)  # angular, linear
             mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_SITE, self._site, motion, 0)
             blade = motion[3:] + np.cross(motion[:3], place - data.site_xpos[self._site])
-        rotation = data.xmat[self._ball_body].reshape(3, 3)
-        spin = rotation @ data.qvel[v + 3 : v + 6]
+        spin = self.ball_spin
         slip = before + np.cross(spin, -BALL_RADIUS * normal) - blade
         normal_speed = slip @ normal
         slip -= normal * normal_speed
@@ -290,7 +284,7 @@ class World:
         change = -alpha * slip
         data.qvel[v : v + 3] += change
         spin = spin - BALL_MASS * BALL_RADIUS / SHELL_INERTIA * np.cross(normal, change)
-        data.qvel[v + 3 : v + 6] = rotation.T @ spin
+        data.qvel[v + 3 : v + 6] = data.xmat[self._ball_body].reshape(3, 3).T @ spin
 
 
 def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjModel:

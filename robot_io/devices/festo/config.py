@@ -9,31 +9,6 @@ from typing import Annotated
 import numpy as np
 
 from ballmodel.io.ranges import Within
-from robot_io.devices.festo.modbus_link import RegisterLink
-from robot_io.devices.festo.profile import AxisProfile
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One axis of the robot.
-
-    lower, upper  range that is ever commanded [m], robot's coordinate
-    zero          [m] where the drive's coordinate reads 0; direction (1 or -1) of the drive's coordinate in the robot's
-    """
-
-    name: str
-    link: RegisterLink
-    profile: AxisProfile
-    lower: float
-    upper: float
-    zero: float = 0.0
-    direction: int = 1
-
-    def __post_init__(self) -> None:
-        if not self.lower < self.upper:
-            raise ValueError(f"axis {self.name}: lower {self.lower} must be below upper {self.upper}")
-        if self.direction not in (1, -1):
-            raise ValueError(f"axis {self.name}: direction {self.direction} must be 1 or -1")
 
 
 @dataclass(frozen=True)

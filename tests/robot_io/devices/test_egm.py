@@ -11,8 +11,8 @@ import pytest
 from google.protobuf import descriptor_pb2
 
 from robot_io.devices.egm import messages
-from robot_io.devices.egm.messages import decode_robot, decode_sensor, encode_robot, encode_sensor
-from robot_io.devices.egm.session import EgmConfig, EgmError, EgmSession
+from robot_io.devices.egm.messages import EgmError, decode_robot, decode_sensor, encode_robot, encode_sensor
+from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.udp import UdpSocket
 from robot_io.errors import DeviceError
 
@@ -57,7 +57,7 @@ def connected(now=0.0, **config):
 
 def test_robot_message_is_read_from_bytes_worked_out_by_hand():
     message = decode_robot(ROBOT)
-    assert (message.sequence, message.time_ms) == (128, 300)
+    assert (message.sequence, message.time) == (128, 0.3)
     assert (message.motors_on, message.egm_running, message.rapid_running) == (True, True, True)
     radians = [np.pi / 2, -np.pi / 4, np.pi, np.pi / 180, np.pi / 360, 0]
     np.testing.assert_allclose(message.position, radians, rtol=1e-15)

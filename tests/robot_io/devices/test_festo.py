@@ -19,14 +19,16 @@ from robot_io.devices.festo import (
     AxisCommand,
     AxisLost,
     CmmtProfile,
-    DirectLink,
     FestoAxes,
     FhppProfile,
     ModbusLink,
 )
-from robot_io.devices.festo.channel import Channel
+from robot_io.devices.festo.axis import Channel
 from robot_io.devices.festo.profile import AxisStatus
-from robot_io.emulator.axes import AxisEmulator, AxisUnits, DriveParams, serve
+from robot_io.emulator.axes import AxisEmulator
+from robot_io.emulator.axis_drive import DriveParams
+from robot_io.emulator.axis_registers import AxisUnits
+from robot_io.emulator.axis_server import AxisServer
 from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
@@ -64,7 +66,7 @@ def test_an_axis_that_was_pushed_away_is_held_where_it_stands_then():
         channel.hold(now)
         held.append(channel.held)
     assert held[10] == 0.1 and held[-1] == 0.15
-    channel.follow()
+    channel.release()
     channel.hold(now + 5.0)  # after a silence nothing says that it stands
     assert channel.held is None
 
@@ -168,7 +170,7 @@ def test_numbers_that_do_not_fit(profile):
 
 def test_modbus_link_both_ways_of_asking():
     emulator = AxisEmulator("cmmt")
-    with serve(emulator) as server:
+    with AxisServer(emulator) as server:
         for combined in (True, False):
             link = ModbusLink("127.0.0.1", server.port, timeout=1.0, combined=combined)
             image = CmmtProfile().encode(AxisCommand(position=0.1 + combined))
@@ -181,7 +183,7 @@ def test_modbus_link_both_ways_of_asking():
 def test_modbus_link_says_what_is_wrong():
     emulator = AxisEmulator("cmmt")
     image = CmmtProfile().encode(AxisCommand())
-    with serve(emulator) as server:
+    with AxisServer(emulator) as server:
         wrong_id = ModbusLink("127.0.0.1", server.port, timeout=1.0, device_id=9)
         with pytest.raises(AxisLost, match="device id 9: it refused"):
             wrong_id.exchange(0, image, 100, 28)
@@ -312,8 +314,8 @@ def test_targets_stay_within_the_axis(profile):
 
 def test_axes_may_count_the_other_way_round():
     rig = LockStep(start=(0.2, -0.1))
-    axes = [Axis("x", DirectLink(rig.emulators[0]), CmmtProfile(), -1.0, 1.0, zero=0.5, direction=-1)]
-    axes += [Axis("y", DirectLink(rig.emulators[1]), CmmtProfile(), -0.5, 0.5)]
+    axes = [Axis("x", rig.emulators[0], CmmtProfile(), -1.0, 1.0, zero=0.5, direction=-1)]
+    axes += [Axis("y", rig.emulators[1], CmmtProfile(), -0.5, 0.5)]
     rig.axes = FestoAxes(axes)
     rig.start()
     np.testing.assert_allclose(rig.axes.state.position, [0.3, -0.1], atol=1e-6)  # 0.5 - 0.2
@@ -383,7 +385,7 @@ def test_losing_either_axis_stops_the_other_in_the_same_cycle(lost):
     rig.emulators[lost].disconnect()
     stream(rig.now)
     rig.axes.cycle(rig.now)
-    assert not other.outputs[0] & 0x0040  # no task any more
+    assert not other.bank.outputs[0] & 0x0040  # no task any more
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -583,9 +585,9 @@ def test_stop_and_disable():
     rig.axes.stop()
     stop = rig.now
     rig.run(0.3, lambda now: rig.axes.command((0.0, 0.0), (0.5, 0.0), stop))  # commands from before count no more
-    assert abs(rig.velocity[0]) < 0.002 and rig.axes.problem(rig.now) is None and rig.axes.standing()
+    assert abs(rig.velocity[0]) < 0.002 and rig.axes.problem(rig.now) is None and rig.axes.standing
     rig.run(0.3, Stream(rig, steady))
-    assert rig.velocity[0] > 0.4 and not rig.axes.standing()
+    assert rig.velocity[0] > 0.4 and not rig.axes.standing
     rig.axes.disable()
     rig.run(0.3, stream)
     assert not any(e.drive.operating for e in rig.emulators) and abs(rig.velocity[0]) < 1e-3
@@ -615,20 +617,20 @@ def test_problems_before_the_first_motion():
 
 
 def test_a_drive_that_does_not_take_the_node_guard():
-    rig = LockStep(wrap=NoGuard, node_guard=1.0)
+    rig = LockStep(kind=NoGuard, node_guard=1.0)
     rig.run(0.05)
     assert rig.axes.fault.cause == "node_guard" and "[100, 0] as [1000, 0]" in rig.axes.problem(rig.now)
-    assert LockStep(node_guard=5.0).start().emulators[0].node_guard == 0.1  # one that does
+    assert LockStep(node_guard=5.0).start().emulators[0].bank.node_guard == 0.1  # one that does
 
 
-class NoGuard(DirectLink):
+class NoGuard(AxisEmulator):
     """A drive that answers the node guard with what was written, and does not take it."""
 
     def exchange(self, write_address, values, read_address, count):
         return values if write_address == 400 else super().exchange(write_address, values, read_address, count)
 
 
-class SwappedGuard(DirectLink):
+class SwappedGuard(AxisEmulator):
     """The words of a drive's node guard come high word first."""
 
     def exchange(self, write_address, values, read_address, count):
@@ -638,10 +640,10 @@ class SwappedGuard(DirectLink):
 
 
 def test_a_node_guard_whose_words_are_swapped_is_refused():
-    rig = LockStep(wrap=SwappedGuard, node_guard=1.0)
+    rig = LockStep(kind=SwappedGuard, node_guard=1.0)
     rig.run(0.05)
     assert rig.axes.fault.cause == "node_guard" and "are its words swapped" in rig.axes.problem(rig.now)
-    assert rig.emulators[0].node_guard == 1.0
+    assert rig.emulators[0].bank.node_guard == 1.0
 
 
 @pytest.mark.parametrize(
@@ -666,7 +668,7 @@ def test_a_drive_that_counts_otherwise_gets_no_power(units, says):
 def test_a_drive_that_tells_no_units_gets_no_power():
     rig = LockStep()
     for emulator in rig.emulators:
-        emulator._parameters.pop((12346, 0))
+        emulator.bank._parameters.pop((12346, 0))
     rig.axes.enable()
     rig.run(0.5)
     assert rig.axes.fault.cause == "units" and "12346" in rig.axes.problem(rig.now)
@@ -675,7 +677,7 @@ def test_a_drive_that_tells_no_units_gets_no_power():
 
 def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
     """The operator's whole request at once: acknowledge, enable, home."""
-    rig = LockStep(wrap=NoGuard, node_guard=1.0)
+    rig = LockStep(kind=NoGuard, node_guard=1.0)
     rig.run(0.05)
     for _ in range(3):
         for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
@@ -683,7 +685,7 @@ def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
         rig.run(0.5)
         assert rig.axes.fault.cause == "node_guard"
         for emulator in rig.emulators:
-            assert not emulator.outputs[0] & 0x0801  # ON, START_HOMING
+            assert not emulator.bank.outputs[0] & 0x0801  # ON, START_HOMING
             assert not emulator.drive.operating and not emulator.drive.homing and not emulator.drive.homed
 
 
@@ -713,7 +715,7 @@ def test_an_axis_that_is_gone_ends_the_other_ones_homing(profile, gone, how):
     before = other.images
     rig.axes.cycle(rig.now)
     assert other.images > before and not rig.axes.homing
-    assert not other.outputs[0] & (0x0800 if profile == "cmmt" else 0x0004)  # START_HOMING, HOM
+    assert not other.bank.outputs[0] & (0x0800 if profile == "cmmt" else 0x0004)  # START_HOMING, HOM
     rig.run(0.1)
     assert not other.drive.homing and other.drive.operating  # it holds
     rig.emulators[gone].reconnect()
@@ -767,7 +769,7 @@ def test_commands_are_checked():
     for position, velocity in [((0, np.nan), (0, 0)), ((0, 0), (np.inf, 0)), ((0, 0, 0), (0, 0)), ((0, 0), 0.0)]:
         with pytest.raises(ValueError, match="2 finite numbers"):
             axes.command(position, velocity, 0.0)
-    link = DirectLink(AxisEmulator())
+    link = AxisEmulator()
     with pytest.raises(ValueError, match="below upper"):
         Axis("x", link, CmmtProfile(), 1.0, -1.0)
     with pytest.raises(ValueError, match="direction"):
@@ -791,7 +793,7 @@ class RealTime:
         self.emulators = [AxisEmulator(kind) for _ in range(2)]
         self.position, self.velocity = np.zeros(2), np.zeros(2)
         self.step(time.monotonic(), 0.0)
-        self.servers = [serve(e) for e in self.emulators]
+        self.servers = [AxisServer(e) for e in self.emulators]
         self.finish = threading.Event()
         self.thread = threading.Thread(target=self.run, daemon=True)
 

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from robot_io.devices.festo import AxisCommand, AxisLost, CmmtProfile, FhppProfile, ModbusLink
-from robot_io.emulator.axes import AxisEmulator, DriveParams, Power, serve
+from robot_io.emulator.axes import AxisEmulator
+from robot_io.emulator.axis_drive import DriveParams, Power
 from robot_io.emulator.axis_motion import advance, brake
+from robot_io.emulator.axis_server import AxisServer
 from tests.support.axes_lockstep import PROFILES, LockStep, Stream
 
 A, V = 15.0, 2.0  # [m/s^2], [m/s]
@@ -269,9 +271,9 @@ def test_status_words_of_telegram_111():
 def test_registers_that_there_are():
     cmmt, fhpp = AxisEmulator("cmmt"), AxisEmulator("fhpp")
     cmmt.exchange(400, [123, 0], 400, 2)
-    assert cmmt.node_guard == 0.123
+    assert cmmt.bank.node_guard == 0.123
     cmmt.exchange(400, [0x86A0, 1], 400, 2)
-    assert cmmt.node_guard == 100.0
+    assert cmmt.bank.node_guard == 100.0
     zeros = [0] * 28
     for write, values, read, count in [
         (0, zeros[:10], 100, 28),  # less than the telegram
@@ -305,7 +307,7 @@ def test_registers_that_there_are():
 def served():
     emulator = AxisEmulator("cmmt")
     emulator.step(0.0, 0.3, 0.0)
-    with serve(emulator) as server:
+    with AxisServer(emulator) as server:
         yield emulator, server
 
 
@@ -334,7 +336,7 @@ def test_read_write_multiple_registers_byte_for_byte(served):
     answer = ask(server, frame(0x17, read_write(), transaction=0x1234), parts=3)
     assert answer[:9] == bytes.fromhex("12340000003b011738")  # 59 bytes: unit, 0x17, 56, 28 registers
     assert struct.unpack(">28H", answer[9:]) == tuple(emulator.read(100, 28))
-    assert emulator.images == 1 and emulator.outputs == IMAGE
+    assert emulator.images == 1 and emulator.bank.outputs == IMAGE
 
 
 @pytest.mark.parametrize(
@@ -400,9 +402,9 @@ def test_a_pulled_cable_is_silence(served):
 
 def test_a_port_in_use(served):
     with pytest.raises(OSError, match=f"port {served[1].port}"):
-        serve(AxisEmulator("cmmt"), port=served[1].port)
+        AxisServer(AxisEmulator("cmmt"), port=served[1].port)
     with pytest.raises(ValueError, match="every id"):
-        serve(AxisEmulator("cmmt"), device_id=0)
+        AxisServer(AxisEmulator("cmmt"), device_id=0)
 
 
 def is_sound(data):
@@ -464,16 +466,16 @@ def test_damaged_requests_neither_command_nor_crash(served):
         except ConnectionError:
             pass
     assert server.refused < 300  # the others were taken and read
-    assert emulator.images == 0 and emulator.node_guard == 1.0
+    assert emulator.images == 0 and emulator.bank.node_guard == 1.0
     link = ModbusLink("127.0.0.1", server.port, timeout=1.0)
     link.exchange(0, IMAGE, 100, 28)
-    assert emulator.images == 1 and emulator.outputs == IMAGE
+    assert emulator.images == 1 and emulator.bank.outputs == IMAGE
 
 
 def test_fhpp_over_tcp():
     emulator = AxisEmulator("fhpp")
     emulator.step(0.0, 0.3, 0.0)
-    with serve(emulator, device_id=255) as server:
+    with AxisServer(emulator, device_id=255) as server:
         profile = FhppProfile()
         link = ModbusLink("127.0.0.1", server.port, timeout=1.0, device_id=255)
         status = profile.decode(link.exchange(0, profile.encode(AxisCommand()), 0, 4))

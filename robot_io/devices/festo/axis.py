@@ -1,15 +1,26 @@
-"""One linear axis as its drive answers, and where it is held while it follows no commands."""
+"""One linear axis: its settings, its drive's answers, its motion, and where it is held while it follows no commands.
+
+To follow a velocity v, the target is put beyond the place where braking from v would have to start, so that the drive
+runs at the given speed; the speed is v plus a correction,
+
+    u = v + k (r(t - L) - x(t)),   |k (...)| <= max_correction
+
+of the measured position x against the commanded one r as it was the whole latency L ago, which is when it should be
+there. The correction is a proportional controller around a pure delay, without overshoot while k L <= 1/e.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from robot_io.devices.festo.config import Axis
-from robot_io.devices.festo.profile import AxisStatus
+from robot_io.devices.festo.config import AxesConfig
+from robot_io.devices.festo.modbus_link import RegisterLink
+from robot_io.devices.festo.profile import AxisCommand, AxisProfile, AxisStatus
 
 STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
 # [s] of the same, for one that is held: longer than a drive swings to and fro. At every turn of a swing an axis stands
@@ -21,6 +32,50 @@ LONGEST_BRAKING, SHAKING_WAY, SHAKING = 0.5, 5e-3, 1.0
 BACK = 0.5
 FASTEST = 1.5  # times the highest speed: a position that came faster is not believed
 JITTER = 0.035  # [s] by which the time between two measurements may differ from that between two cycles
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the robot.
+
+    lower, upper  range that is ever commanded [m], robot's coordinate
+    zero          [m] where the drive's coordinate reads 0; direction (1 or -1) of the drive's coordinate in the robot's
+    """
+
+    name: str
+    link: RegisterLink
+    profile: AxisProfile
+    lower: float
+    upper: float
+    zero: float = 0.0
+    direction: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.lower < self.upper:
+            raise ValueError(f"axis {self.name}: lower {self.lower} must be below upper {self.upper}")
+        if self.direction not in (1, -1):
+            raise ValueError(f"axis {self.name}: direction {self.direction} must be 1 or -1")
+
+
+@dataclass(frozen=True)
+class Move:
+    """Motion of one axis: to ``position`` [m] at up to ``speed`` [m/s]; ``velocity`` is the set-point u."""
+
+    position: float
+    speed: float
+    velocity: float
+
+
+def follow(axis: Axis, position: float, velocity: float, error: float, config: AxesConfig) -> Move:
+    """The move of an axis that is to be at ``position`` [m] with ``velocity`` [m/s] now and lags by ``error`` [m]."""
+    correction = min(max(config.gain * error, -config.max_correction), config.max_correction)
+    u = min(max(velocity + correction, -config.speed), config.speed)
+    speed, lead = abs(u), 0.0
+    if velocity == 0.0:
+        speed = max(speed, config.hold_speed)  # the drive goes to the very position
+    else:
+        lead = math.copysign(0.5 * u * u / config.acceleration + speed * config.lead, u)
+    return Move(min(max(position + lead, axis.lower), axis.upper), speed, u)
 
 
 class Channel:
@@ -44,6 +99,16 @@ class Channel:
         self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_AGAIN
         self._idle_since, self._held_since = math.inf, -math.inf  # [s] without commands; held at this place
 
+    @property
+    def fault_text(self) -> str:
+        return "no answer" if self.status is None else self.axis.profile.fault_text(self.status.fault_code)
+
+    def exchange(self, command: AxisCommand) -> AxisStatus:
+        """The drive's answer to a command. Raises AxisLost; ValueError for what does not fit the registers."""
+        profile, link = self.axis.profile, self.axis.link
+        image = profile.encode(command)
+        return profile.decode(link.exchange(profile.write_address, image, profile.read_address, profile.read_count))
+
     def answered(self, status: AxisStatus, now: float, speed: float) -> None:
         """Take an answer of an axis whose highest speed is ``speed`` [m/s]."""
         position, homed = self.axis.zero + self.axis.direction * status.position, self.status and self.status.homed
@@ -54,7 +119,7 @@ class Channel:
         while len(self._past) > 1 and self._past[1][0] <= now - STANDING_AGAIN:
             self._past.popleft()
 
-    def follow(self) -> None:
+    def release(self) -> None:
         """It follows commands, and is held nowhere."""
         self.held, self._idle_since, self._held_since = None, math.inf, -math.inf
 
