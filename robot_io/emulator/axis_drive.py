@@ -49,10 +49,8 @@ class Drive:
 
     def __init__(self, params: DriveParams) -> None:
         self.params = params
-        self.power = Power.INHIBITED
-        self.fault_code = 0
-        self.homed = False
-        self.homing = False
+        self.power, self.fault_code = Power.INHIBITED, 0
+        self.homed = self.homing = False
         self.task = False  # a positioning task is active
         self.paused = False  # brakes and keeps the task
         self.target = 0.0
@@ -105,23 +103,19 @@ class Drive:
         if self.power is not Power.SWITCHING_OFF:
             self.power = Power.INHIBITED
 
-    def home(self) -> bool:
-        """Starts homing; False when the drive cannot now."""
-        if not self.operating or self.v != 0.0:
-            return False
-        self.homing, self.homed, self.task = True, False, False
-        self._until = self._now + self.params.homing_time
-        return True
+    def home(self) -> None:
+        """Starts homing; nothing where the drive cannot now."""
+        if self.operating and self.v == 0.0:
+            self.homing, self.homed, self.task = True, False, False
+            self._until = self._now + self.params.homing_time
 
-    def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> bool:
-        """A positioning task (reported coordinate); False if refused: not operating, homing, absolute and not homed."""
-        if not self.operating or self.homing or not (self.homed or relative) or acceleration <= 0.0:
-            return False
-        self.target = self.x + target if relative else target + (self.origin or 0.0)
-        self._speed = min(max(speed, 0.0), self.params.speed)
-        self.acceleration = min(acceleration, self.params.acceleration)
-        self.task, self.paused = True, False
-        return True
+    def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> None:
+        """A positioning task (reported coordinate); refused where not operating, homing, absolute and not homed."""
+        if self.operating and not self.homing and (self.homed or relative) and acceleration > 0.0:
+            self.target = self.x + target if relative else target + (self.origin or 0.0)
+            self._speed = min(max(speed, 0.0), self.params.speed)
+            self.acceleration = min(acceleration, self.params.acceleration)
+            self.task, self.paused = True, False
 
     def halt(self) -> None:
         """Brakes and drops the task."""

@@ -133,7 +133,7 @@ class Rig:
         if self.params.hidden.stop_wired:
             self.motors_off()
             for axis in range(len(self.ports.axes)):
-                self._to_axis("stop", axis)
+                self._to_axis("cut_power", axis)
 
     def hold(self, place: Vector | None) -> None:
         """A hand holds the ball at a place (3,) [m], or nowhere any more."""
@@ -145,7 +145,7 @@ class Rig:
 
     def drive_fault(self, axis: int, code: int) -> None:
         """A fault of one linear axis's drive. Raises DeviceError for a robot without such an axis."""
-        self._to_axis("fault", axis, code)
+        self._to_axis("inject_fault", axis, code)
 
     def connect_arm(self, connected: bool) -> None:
         """Pulls the network cable of the arm's controller or plugs it in again."""
@@ -153,9 +153,10 @@ class Rig:
 
     def connect_axis(self, axis: int, connected: bool) -> None:
         """Pulls a linear axis's network cable or plugs it in again. Raises DeviceError as ``drive_fault`` does."""
-        self._to_axis("connect", axis, connected)
+        self._to_axis("reconnect" if connected else "disconnect", axis)
 
     def _to_axis(self, request: str, axis: int, *details: int) -> None:
+        """Calls a method of an ``AxisEmulator``."""
         if not 0 <= axis < len(self.ports.axes):
             raise DeviceError(f"rig: {self._contract.robot} has {len(self.ports.axes)} linear axes, no number {axis}")
         self._pipes["axes"].send((request, axis, *details))
@@ -356,13 +357,8 @@ def _axes(part: _Part) -> None:
         motion = Motion(shared)
         part.pipe.send("ready")
         for now in _paced(shared, AXIS_CYCLE):
-            for kind, axis, *rest in _requests(part.pipe):
-                if kind == "connect":
-                    emulators[axis].disconnected = not rest[0]
-                elif kind == "fault":
-                    emulators[axis].inject_fault(rest[0])
-                else:
-                    emulators[axis].cut_power()
+            for request, axis, *details in _requests(part.pipe):
+                getattr(emulators[axis], request)(*details)
             shared["driven"][1] = now - AXIS_CYCLE
             qpos, qvel = motion.at(now)
             for k, (i, emulator) in enumerate(zip(carrying, emulators, strict=True)):

@@ -47,6 +47,7 @@ FINE = 4  # steps instead of one near a surface
 NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
 
 Vector = Sequence[float] | np.ndarray  # (3,)
+ZERO = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,10 @@ class World:
         free = self.model.joint("ball_free")
         self._ball_q, self._ball_v = int(free.qposadr[0]), int(free.dofadr[0])
         self._ball_body = self.model.body("ball").id
+        # Views of the ball's state; the spin is in its body's frame, which the rotation turns into the table's.
+        self._position, self._velocity = self.data.qpos[self._ball_q :][:3], self.data.qvel[self._ball_v :][:3]
+        self._body_spin = self.data.qvel[self._ball_v + 3 :][:3]
+        self._rotation = self.data.xmat[self._ball_body].reshape(3, 3)
         self._ball_geom, self._paddle_geom = self.model.geom("ball").id, self.model.geom("rig_paddle").id
         self._site = self.model.site("paddle").id
         self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in contract.joints]].copy()
@@ -124,17 +129,16 @@ class World:
     @property
     def ball(self) -> np.ndarray:
         """Position (3,) [m] of the ball, wherever it is."""
-        return self.data.qpos[self._ball_q : self._ball_q + 3].copy()
+        return self._position.copy()
 
     @property
     def ball_velocity(self) -> np.ndarray:
-        return self.data.qvel[self._ball_v : self._ball_v + 3].copy()
+        return self._velocity.copy()
 
     @property
     def ball_spin(self) -> np.ndarray:
         """Angular velocity (3,) [rad/s] in the table frame."""
-        v = self._ball_v
-        return self.data.xmat[self._ball_body].reshape(3, 3) @ self.data.qvel[v + 3 : v + 6]
+        return self._rotation @ self._body_spin
 
     @property
     def answered(self) -> bool:
@@ -142,7 +146,7 @@ class World:
         hit = next((t for t, name, _ in self.touches if name == "rig_paddle"), None)
         return hit is None or not any(name == "col_table" and t > hit and p[1] > 0.0 for t, name, p in self.touches)
 
-    def throw(self, position: Vector, velocity: Vector, spin: Vector = (0.0, 0.0, 0.0)) -> None:
+    def throw(self, position: Vector, velocity: Vector, spin: Vector = ZERO) -> None:
         """Puts a new ball into play."""
         self.number, self.in_play = self.number + 1, True
         self._start(position, velocity, spin)
@@ -183,13 +187,12 @@ class World:
 
     def park(self) -> None:
         """Takes the ball out of play."""
-        self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._place(PARKED, ZERO, ZERO)
         self.in_play = False
 
     def _place(self, position: Vector, velocity: Vector, spin: Vector) -> None:
-        q, v = self._ball_q, self._ball_v
-        self.data.qpos[q : q + 7] = [*position, 1.0, 0.0, 0.0, 0.0]
-        self.data.qvel[v : v + 6] = [*velocity, *spin]
+        self.data.qpos[self._ball_q :][:7] = [*position, 1.0, 0.0, 0.0, 0.0]
+        self.data.qvel[self._ball_v :][:6] = [*velocity, *spin]
         self.data.xfrc_applied[self._ball_body] = 0.0
 
     def advance(self, setpoint: np.ndarray, duration: float) -> None:
@@ -203,42 +206,35 @@ class World:
         if self.visible and not self.in_play:
             self._integrate(1, duration)
             place = self.clipped if self.on_blade else self.held
-            self._place(PARKED if place is None else place, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self._place(PARKED if place is None else place, ZERO, ZERO)
             return
         if not self.in_play:
-            self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self._place(PARKED, ZERO, ZERO)
             self._integrate(1, duration)
             return
         steps = FINE if self._near_surface() else 1
         self._integrate(steps, duration / steps)
-        if self.data.qpos[self._ball_q + 2] < FLOOR or abs(self.data.qpos[self._ball_q + 1]) > 5.0 or self._resting():
+        _, y, z = self._position
+        resting = z < 2.0 * BALL_RADIUS and self._velocity @ self._velocity < RESTING**2  # nobody plays it any more
+        if z < FLOOR or abs(y) > 5.0 or resting:
             self.park()
 
-    def _resting(self) -> bool:
-        """True for a ball that lies on the table: nobody plays it any more."""
-        height, velocity = self.data.qpos[self._ball_q + 2], self.data.qvel[self._ball_v : self._ball_v + 3]
-        return bool(height < 2.0 * BALL_RADIUS and velocity @ velocity < RESTING**2)
-
     def _near_surface(self) -> bool:
-        x, y, z = self.data.qpos[self._ball_q : self._ball_q + 3]
-        if z < NEAR and abs(x) < 0.8 and abs(y) < 1.45:
-            return True
-        if abs(y) < NEAR and z < 0.25:
-            return True
-        arm = self.data.qpos[self._ball_q : self._ball_q + 3] - self.data.site_xpos[self._site]
-        return bool(arm @ arm < (PADDLE_RADIUS + NEAR) ** 2)
+        x, y, z = self._position
+        over_table, at_net = z < NEAR and abs(x) < 0.8 and abs(y) < 1.45, abs(y) < NEAR and z < 0.25
+        arm = self._position - self.data.site_xpos[self._site]
+        return bool(over_table or at_net or arm @ arm < (PADDLE_RADIUS + NEAR) ** 2)
 
     def _integrate(self, steps: int, timestep: float) -> None:
-        data, v = self.data, self._ball_v
+        data, velocity = self.data, self._velocity
         self.model.opt.timestep = timestep
         for _ in range(steps):
             if self.in_play:
-                velocity = data.qvel[v : v + 3]
                 acceleration = -self.params.drag * np.sqrt(velocity @ velocity) * velocity
-                if self.params.magnus:  # a free joint's angular velocity is in the body's frame
+                if self.params.magnus:
                     acceleration += self.params.magnus * np.cross(self.ball_spin, velocity)
                 data.xfrc_applied[self._ball_body, :3] = BALL_MASS * acceleration
-            before = data.qvel[v : v + 3].copy()
+            before = velocity.copy()
             mujoco.mj_step(self.model, data)
             if data.ncon or self._touching:
                 self._contacts(before)
@@ -263,9 +259,8 @@ class World:
 
         alpha: by Coulomb on table and net, the rubber's gain on the paddle.
         """
-        data, q, v = self.data, self._ball_q, self._ball_v
-        position = data.qpos[q : q + 3]
-        if normal @ (position - place) < 0:
+        data = self.data
+        if normal @ (self._position - place) < 0:
             normal = -normal
         blade = np.zeros(3)
         if surface == self._paddle_geom:
@@ -282,9 +277,9 @@ class World:
             limit = friction * (1.0 + restitution) * abs(normal_speed) / max(np.sqrt(slip @ slip), 1e-9)
             alpha = min(limit, STICKING)
         change = -alpha * slip
-        data.qvel[v : v + 3] += change
+        self._velocity += change
         spin = spin - BALL_MASS * BALL_RADIUS / SHELL_INERTIA * np.cross(normal, change)
-        data.qvel[v + 3 : v + 6] = data.xmat[self._ball_body].reshape(3, 3).T @ spin
+        self._body_spin[:] = self._rotation.T @ spin
 
 
 def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjModel:

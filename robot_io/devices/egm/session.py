@@ -103,8 +103,7 @@ class EgmSession:
         self.statistics.received += 1
         if not self._trusts(source, now):
             self._note_rival(datagram, source, now)
-            address = self.config.controller_address or (self.endpoint[0] if self.endpoint else "no address")
-            port = self.config.controller_port or (self.endpoint[1] if self.endpoint else None)
+            address, port = self._trusted
             trusted = address if port is None or source[0] != address else f"{address} port {port}"
             return self._refuse("stranger", f"from {source[0]} port {source[1]}, only {trusted} is trusted")
         try:
@@ -192,13 +191,16 @@ class EgmSession:
             return
         self._rival = (source[1], now)
 
+    @property
+    def _trusted(self) -> tuple[str | None, int | None]:
+        """Address and port of the controller as configured, else as learned; None: any."""
+        address, port = self.endpoint or (None, None)
+        return self.config.controller_address or address, self.config.controller_port or port
+
     def _trusts(self, source: tuple[str, int], now: float) -> bool:
-        address = self.config.controller_address or (self.endpoint and self.endpoint[0])
-        if address and source[0] != address:
-            return False
-        if self.config.controller_port is not None:
-            return source[1] == self.config.controller_port
-        return self.endpoint is None or source[1] == self.endpoint[1] or self._is_stale(now)
+        address, port = self._trusted
+        learns = self.config.controller_port is None and self._is_stale(now)
+        return address in (None, source[0]) and (learns or port in (None, source[1]))
 
     def _is_stale(self, now: float) -> bool:
         return self.feedback is None or now - self.feedback.received > self.config.timeout

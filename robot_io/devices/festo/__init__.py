@@ -1,9 +1,8 @@
 """Two linear axes of Festo over Modbus TCP."""
 
 from robot_io.devices.festo.axes import FestoAxes
-from robot_io.devices.festo.axis import Axis
+from robot_io.devices.festo.axis import AxesConfig, Axis
 from robot_io.devices.festo.cmmt import CmmtProfile
-from robot_io.devices.festo.config import AxesConfig
 from robot_io.devices.festo.fhpp import FhppProfile
 from robot_io.devices.festo.modbus_link import AxisLost, ModbusLink
 from robot_io.devices.festo.profile import AxisCommand, AxisProfile

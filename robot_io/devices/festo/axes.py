@@ -19,8 +19,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.devices.festo.axis import BACK, Axis, Channel, Move, follow
-from robot_io.devices.festo.config import AxesConfig, AxesFault, AxesState
+from robot_io.devices.festo.axis import BACK, AxesConfig, AxesFault, AxesState, Axis, Channel, Move, follow
 from robot_io.devices.festo.modbus_link import AxisLost
 from robot_io.devices.festo.profile import AxisCommand, AxisStatus, SetUpError
 from robot_io.history import History

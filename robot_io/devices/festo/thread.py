@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from robot_io.devices.festo.axes import DEFAULTS, FestoAxes
-from robot_io.devices.festo.axis import Axis
-from robot_io.devices.festo.config import AxesConfig
+from robot_io.devices.festo.axis import AxesConfig, Axis
 
 STOPPING = 1.0  # [s] for coming to rest at the end
 

@@ -94,22 +94,20 @@ def test_output_registers_of_telegram_111(command, start):
     assert CmmtProfile().encode(command) == start + [0] * 17
 
 
+def states(status):
+    return status.ready, status.enabled, status.fault, status.homed, status.homing
+
+
 def test_input_registers_of_telegram_111():
     # Operating, homed; -250000 um; -0.5 of 0x40000000, so -1 m/s of 2 m/s; warning 12.
     words = [0x2F37, 0x8000, 0, 0, 0, 0x2F70, 0xFFFC, 0x0000, 0xE000, 0, 12]
     status = CmmtProfile().decode(words + [0] * 17)
     assert status.position == pytest.approx(-0.25, abs=1e-12) and status.velocity == pytest.approx(-1.0, abs=1e-12)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (True, True, False, True, False)
+    assert states(status) == (True, True, False, True, False)
     assert (status.fault_code, status.warning_code) == (0, 12)
     # Fault, inhibited; homing active; fault 126.
     status = CmmtProfile().decode([0x0248, 0x0800, 0, 0, 0, 0, 0, 0, 0, 126, 0] + [0] * 17)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
-        False,
-        False,
-        True,
-        False,
-        True,
-    )
+    assert states(status) == (False, False, True, False, True)
     assert status.fault_code == 126 and "following error" in CmmtProfile().fault_text(126)
     assert CmmtProfile().fault_text(999).startswith("999: look")
 
@@ -142,15 +140,9 @@ def test_input_registers_of_fhpp():
     # SCON: enabled, open, load voltage, OPM1 = 0x53; SPOS: halt off, moving, referenced = 0x91; -50 % = 0xCE
     status = FhppProfile().decode([0x5391, 0x00CE, 0xFFFF, 0x9E58])
     assert status.position == pytest.approx(-0.25, abs=1e-12) and status.velocity == pytest.approx(-1.0, abs=1e-12)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (True, True, False, True, False)
+    assert states(status) == (True, True, False, True, False)
     status = FhppProfile().decode([0x1800, 0, 0, 0])  # load voltage, fault
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
-        False,
-        False,
-        True,
-        False,
-        False,
-    )
+    assert states(status) == (False, False, True, False, False)
     assert not FhppProfile().decode([0x3000, 0, 0, 0]).ready  # the set-up tool has control
 
 
@@ -616,13 +608,6 @@ def test_problems_before_the_first_motion():
     assert rig.axes.fault.cause == "enable_timeout" and "load voltage" in rig.axes.problem(rig.now)
 
 
-def test_a_drive_that_does_not_take_the_node_guard():
-    rig = LockStep(kind=NoGuard, node_guard=1.0)
-    rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "[100, 0] as [1000, 0]" in rig.axes.problem(rig.now)
-    assert LockStep(node_guard=5.0).start().emulators[0].bank.node_guard == 0.1  # one that does
-
-
 class NoGuard(AxisEmulator):
     """A drive that answers the node guard with what was written, and does not take it."""
 
@@ -639,54 +624,44 @@ class SwappedGuard(AxisEmulator):
         return answer[::-1] if read_address == 400 else answer
 
 
-def test_a_node_guard_whose_words_are_swapped_is_refused():
-    rig = LockStep(kind=SwappedGuard, node_guard=1.0)
-    rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "are its words swapped" in rig.axes.problem(rig.now)
-    assert rig.emulators[0].bank.node_guard == 1.0
+class NoUnit(AxisEmulator):
+    """A drive that does not tell one of its units."""
+
+    def __init__(self, *arguments, **keywords):
+        super().__init__(*arguments, **keywords)
+        self.bank._parameters.pop((12346, 0))
 
 
 @pytest.mark.parametrize(
-    ("units", "says"),
+    ("options", "cause", "says"),
     [
-        (dict(base_acceleration=7.5), "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
-        (dict(base_velocity=1.0), "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
-        (dict(position=1e-5), "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
-        (dict(velocity=1e-4), "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
+        (dict(kind=NoGuard, node_guard=1.0), "node_guard", "[100, 0] as [1000, 0]"),
+        (dict(kind=SwappedGuard, node_guard=1.0), "node_guard", "are its words swapped"),
+        (dict(kind=NoUnit), "units", "does not tell parameter 12346"),
+        (dict(base_acceleration=7.5), "units", "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
+        (dict(base_velocity=1.0), "units", "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
+        (dict(position=1e-5), "units", "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
+        (dict(velocity=1e-4), "units", "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
     ],
 )
-def test_a_drive_that_counts_otherwise_gets_no_power(units, says):
-    rig = LockStep(units=AxisUnits(**{"position": 1e-6, **units}))
+def test_a_drive_that_would_not_stop_by_itself_or_counts_otherwise_gets_no_power(options, cause, says):
+    """The operator's whole request at once, again and again: acknowledge, enable, home."""
+    units = None if "kind" in options else AxisUnits(**{"position": 1e-6, **options})
+    rig = LockStep(**(options if "kind" in options else {"units": units}))
     rig.run(0.2)
-    for request in (rig.axes.acknowledge, rig.axes.enable):
-        request()
-    rig.run(0.5)
-    assert rig.axes.fault.cause == "units" and says in rig.axes.problem(rig.now)
-    assert not any(emulator.drive.operating for emulator in rig.emulators)
-
-
-def test_a_drive_that_tells_no_units_gets_no_power():
-    rig = LockStep()
-    for emulator in rig.emulators:
-        emulator.bank._parameters.pop((12346, 0))
-    rig.axes.enable()
-    rig.run(0.5)
-    assert rig.axes.fault.cause == "units" and "12346" in rig.axes.problem(rig.now)
-    assert not any(emulator.drive.operating for emulator in rig.emulators)
-
-
-def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
-    """The operator's whole request at once: acknowledge, enable, home."""
-    rig = LockStep(kind=NoGuard, node_guard=1.0)
-    rig.run(0.05)
     for _ in range(3):
+        assert rig.axes.fault.cause == cause and says in rig.axes.problem(rig.now)
         for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
             request()
         rig.run(0.5)
-        assert rig.axes.fault.cause == "node_guard"
         for emulator in rig.emulators:
             assert not emulator.bank.outputs[0] & 0x0801  # ON, START_HOMING
             assert not emulator.drive.operating and not emulator.drive.homing and not emulator.drive.homed
+            assert options.get("node_guard") in (None, emulator.bank.node_guard)
+
+
+def test_the_node_guard_of_robot_yaml_is_the_drives():
+    assert LockStep(node_guard=5.0).start().emulators[0].bank.node_guard == AxesConfig().node_guard
 
 
 def homing(profile="cmmt"):

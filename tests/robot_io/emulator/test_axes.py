@@ -120,11 +120,6 @@ class TestDrive:
         assert duration == pytest.approx(exact, abs=0.010)  # profiles that mark targets by an edge wait a cycle
         assert bench.x == pytest.approx(-0.4, abs=1e-4) and xs.min() > -0.4005
 
-    def test_smoothing_keeps_the_way(self, profile):
-        bench = Bench(profile).operate()
-        bench.run(0.9, **MOVE, position=-0.4)
-        assert bench.x == pytest.approx(-0.4, abs=1e-4)
-
     def test_homing_takes_its_time_and_gives_the_position_its_meaning(self, profile):
         bench = Bench(profile).operate(home=False)
         assert bench.write(enable=True).position == pytest.approx(0.0)  # from where it was switched on
@@ -216,14 +211,6 @@ class TestDrive:
         status = bench.write(**MOVE, position=-0.4)
         assert status.position == pytest.approx(exact, abs=2e-5)
         assert status.velocity == pytest.approx(-1.0, abs=0.02)
-
-    def test_disconnected(self, profile):
-        bench = Bench(profile)
-        bench.emulator.disconnect()
-        with pytest.raises(AxisLost, match="disconnected"):
-            bench.write()
-        bench.emulator.reconnect()
-        bench.write()
 
 
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp continuous"])

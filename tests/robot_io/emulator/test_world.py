@@ -253,7 +253,8 @@ def test_thrower_waits_for_robot_and_ball(world):
     thrower, thrown = Thrower(throws, pause=0.1, first=1), []
     for i in range(300):
         world.advance(STILL, 0.004)
-        if thrower.update(world, world.time):
+        thrower.update(world, world.time)
+        if thrower.thrown > len(thrown):
             thrown.append((i, world.ball))
             np.testing.assert_array_equal(world.ball_velocity, world.ball)
         if i == 100:
