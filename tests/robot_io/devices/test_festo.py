@@ -387,7 +387,7 @@ def test_a_fault_stops_both_and_stays_until_acknowledged(profile):
     rig.emulators[1].inject_fault(51)
     rig.run(0.3, stream)
     problem = rig.axes.problem(rig.now)
-    assert rig.axes.fault.cause == "drive_fault"
+    assert rig.axes.fault.cause == "drive_fault" and not rig.axes.preparable(rig.now)
     assert ("51: power unit too hot" if profile == "cmmt" else "diagnostic memory") in problem
     assert abs(rig.velocity[0]) < 0.002 and rig.position[0] - before < longest_stop()
     for request in (rig.axes.enable, rig.axes.home):  # not before it is acknowledged
@@ -589,9 +589,9 @@ def test_stop_and_disable():
 def test_problems_before_the_first_motion():
     rig = LockStep(config=AxesConfig(homing_timeout=0.5, enable_timeout=0.5))
     command = lambda now: rig.axes.command((0.2, -0.1), (0.0, 0.0), now)  # noqa: E731
-    assert rig.axes.state is None and "not answered yet" in rig.axes.problem(0.0)
+    assert rig.axes.state is None and "not answered yet" in rig.axes.problem(0.0) and not rig.axes.preparable(0.0)
     rig.run(0.1, command)
-    assert "x and y are switched off" in rig.axes.problem(rig.now)
+    assert "x and y are switched off" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
     rig.axes.enable()
     rig.run(0.2, command)
     assert "x and y are not homed" in rig.axes.problem(rig.now)
@@ -725,18 +725,6 @@ def test_a_drive_gets_no_power_while_a_fault_is_latched():
     rig.emulators[0].reconnect()
     rig.run(0.5)
     assert not any(emulator.drive.operating for emulator in rig.emulators)
-
-
-def test_what_switching_on_and_homing_mend_is_told_apart():
-    rig = LockStep()
-    assert not rig.axes.preparable(rig.now)  # they have not answered
-    rig.run(0.1)
-    assert "switched off" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
-    rig.start()
-    assert rig.axes.preparable(rig.now)
-    rig.emulators[0].inject_fault(51)
-    rig.run(0.1)
-    assert not rig.axes.preparable(rig.now)
 
 
 def test_commands_are_checked():

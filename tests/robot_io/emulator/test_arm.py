@@ -19,7 +19,11 @@ CLIENT, CONTROLLER = ("192.168.125.20", 6510), ("192.168.125.1", 50123)
 CYCLE = 0.004
 ZERO = np.zeros(6)
 MAX_SPEED = np.deg2rad([250.0, 250.0, 250.0, 420.0, 590.0, 600.0])  # IRB 120T
-BARE = {"dead_time": 0.0, "pos_corr_gain": 0.0, "low_pass": 1000.0}  # speed of the message of the cycle before, to 1e-11
+BARE = {
+    "dead_time": 0.0,
+    "pos_corr_gain": 0.0,
+    "low_pass": 1000.0,
+}  # speed of the message before, to 1e-11
 
 
 class Rig:
