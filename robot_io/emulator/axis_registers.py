@@ -44,8 +44,9 @@ class Registers(ABC):
 
     guard_code  fault for a computer that has fallen silent
     shortest    registers of an image, of at most ``longest``
-    inputs      first address and number of the registers that report
-    ranges      first and one past the last address of each block of registers
+    inputs      first address of those that report
+    outputs     as last written
+    blocks      all that can be read, by first address
     node_guard  silence after which an enabled drive faults [s], 0 for never
     """
 
@@ -53,12 +54,17 @@ class Registers(ABC):
     guard_code: int
     shortest: int
     longest: int
-    inputs: tuple[int, int]
-    ranges: tuple[tuple[int, int], ...]
+    inputs: int
+    blocks: dict[int, list[int]]
 
     def __init__(self, units: AxisUnits | None, node_guard: float) -> None:
         self.units, self.node_guard = units or self.units, node_guard
-        self.outputs = [0] * self.longest  # as last written
+        self.outputs = [0] * self.longest
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """First and one past the last address of each block."""
+        return [(start, start + len(block)) for start, block in self.blocks.items()]
 
     def readable(self, address: int, count: int) -> bool:
         return count > 0 and any(low <= address and address + count <= high for low, high in self.ranges)
@@ -69,12 +75,16 @@ class Registers(ABC):
             return False
         if address < self.longest:
             return address == 0 and self.shortest <= len(values)
-        return not 0 <= address - self.inputs[0] < self.inputs[1]
+        return self._start(address) != self.inputs
 
     def read(self, address: int, count: int, drive: Drive, position: float, velocity: float) -> list[int]:
         """Registers of a drive that reports this position [m] and velocity [m/s]."""
-        start, block = self.inputs[0], self.report(drive, position, velocity)
-        return block[address - start : address - start + count]
+        self.blocks[self.inputs] = self.report(drive, position, velocity)
+        start = self._start(address)
+        return self.blocks[start][address - start : address - start + count]
+
+    def _start(self, address: int) -> int:
+        return max(start for start in self.blocks if start <= address)
 
     def write(self, address: int, values: list[int]) -> None:
         """Take registers; an image of the outputs does nothing until it is applied."""
@@ -95,14 +105,13 @@ class CmmtRegisters(Registers):
     units = AxisUnits(position=1e-6)
     guard_code = 391
     shortest, longest = 11, 28
-    inputs = 100, 28
-    ranges = ((0, 28), (100, 128), (400, 402), (500, 574))
+    inputs = 100
 
     def __init__(self, units: AxisUnits | None, node_guard: float) -> None:
         super().__init__(units, node_guard)
         self._last = [0] * self.shortest
         milliseconds = round(node_guard * 1000.0)
-        self._guard, self._mailbox = [milliseconds & 0xFFFF, milliseconds >> 16], [0] * 74
+        self.blocks = {0: self.outputs, 100: [0] * 28, 400: [milliseconds & 0xFFFF, milliseconds >> 16], 500: [0] * 74}
         # The drive's units by number and subindex: bytes of data, then words. Resolutions are powers of ten, one byte.
         resolutions = {11724: self.units.position, 11725: self.units.velocity}
         base = self.units.base_acceleration
@@ -111,26 +120,17 @@ class CmmtRegisters(Registers):
         for n, value in reals.items():
             self._parameters[n, 0] = [4, *struct.unpack("<HH", struct.pack("<f", value))]
 
-    def read(self, address: int, count: int, drive: Drive, position: float, velocity: float) -> list[int]:
-        if 100 <= address < 128:
-            return super().read(address, count, drive, position, velocity)
-        start, block = self._block(address)
-        return block[address - start : address - start + count]
-
     def write(self, address: int, values: list[int]) -> None:
-        start, block = self._block(address)
+        start = self._start(address)
+        block = self.blocks[start]
         block[address - start : address - start + len(values)] = values
-        if block is self._guard:
+        if start == 400:
             self.node_guard = (block[0] + 65536 * block[1]) / 1000.0
-        elif block is self._mailbox and address <= 503 < address + len(values):
-            block[3] = self._answer(block[3])
+        elif start == 500 and address <= 503 < address + len(values):
+            block[3] = self._answer(block, block[3])
 
-    def _block(self, address: int) -> tuple[int, list[int]]:
-        return (500, self._mailbox) if address >= 500 else (400, self._guard) if address >= 400 else (0, self.outputs)
-
-    def _answer(self, request: int) -> int:
+    def _answer(self, mailbox: list[int], request: int) -> int:
         """Parameters have no effect: number, subindex, elements, request, length, then from 510 on the data."""
-        mailbox = self._mailbox
         key = (mailbox[0], mailbox[1])
         if request == MAILBOX_WRITE:
             self._parameters[key] = [mailbox[4], *mailbox[10:]]
@@ -188,7 +188,7 @@ class CmmtRegisters(Registers):
         words += _words(round(position / self.units.position))
         words += _words(round(velocity / self.units.base_velocity * FULL * 65536))
         words += [drive.fault_code, 0]
-        return words + [0] * (self.inputs[1] - len(words))
+        return words + [0] * (28 - len(words))
 
 
 class FhppRegisters(Registers):
@@ -197,9 +197,11 @@ class FhppRegisters(Registers):
     units = AxisUnits(position=1e-5)
     guard_code = 0x47
     shortest = longest = 4
-    inputs = 0, 4
-    ranges = ((0, 4),)
-    _last = (0, 0, 0)
+    inputs = 0
+
+    def __init__(self, units: AxisUnits | None, node_guard: float) -> None:
+        super().__init__(units, node_guard)
+        self._last, self.blocks = (0, 0, 0), {0: [0] * 4}
 
     def apply(self, words: list[int], drive: Drive) -> None:
         ccon, cpos, cdir, percent = words[0] >> 8, words[0] & 0xFF, words[1] >> 8, words[1] & 0xFF

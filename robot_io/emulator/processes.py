@@ -9,7 +9,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
@@ -21,6 +21,7 @@ from robot_io.contract import PAPER, Contract
 from robot_io.control import realtime
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.devices.tracker import TrackerConfig
+from robot_io.devices.udp import UdpSocket
 from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axis_server import AxisServer
 from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
@@ -264,21 +265,6 @@ def _requests(pipe: Connection) -> Iterator[Any]:
         yield pipe.recv()
 
 
-@contextmanager
-def _wire() -> Iterator[socket.socket]:
-    """A socket of an emulated device, which never waits."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-        wire.bind((HOST, 0))
-        wire.setblocking(False)
-        yield wire
-
-
-def _send(wire: socket.socket, datagrams: list[bytes], port: int) -> None:
-    for datagram in datagrams:
-        with suppress(OSError):  # nobody listens
-            wire.sendto(datagram, (HOST, port))
-
-
 def _world(part: _Part, scene: str, balls: Throws | Opponent) -> None:
     shared, params = part.shared, part.params
     world = World(scene, params.world, part.contract)
@@ -317,7 +303,7 @@ def _arm(part: _Part) -> None:
     controller = ArmController(client, replace(params.arm, dead_time=params.arm.dead_time + params.action_delay))
     out, back = Network(params.arm_network, params.seed), Network(params.arm_network, params.seed + 1)
     rows, connected, motion = list(part.contract.arm), True, Motion(shared)
-    with _wire() as wire:
+    with UdpSocket(HOST, 0, "rig") as wire:
         part.pipe.send("ready")
         for now in _paced(shared, params.arm.cycle):
             for request in _requests(part.pipe):
@@ -334,12 +320,9 @@ def _arm(part: _Part) -> None:
             shared["driven"][0] = now
             if datagram is not None and connected:
                 out.send(datagram, now)
-            _send(wire, out.due(now), part.ports.arm)
-            while True:
-                try:
-                    reply, source = wire.recvfrom(2048)
-                except OSError:
-                    break
+            for ready in out.due(now):
+                wire.send(ready, client)
+            for reply, source in wire.drain():
                 if connected:
                     back.send(reply, now)
                 if source != client:
@@ -371,7 +354,7 @@ def _tracker(part: _Part) -> None:
     shared, params = part.shared, part.params
     cameras = TrackerEmulator(params.tracker, params.seed + 2, params.hidden)
     network = Network(params.tracker_network, params.seed + 3)
-    with _wire() as wire:
+    with UdpSocket(HOST, 0, "rig") as wire:
         part.pipe.send("ready")
         # Several times a frame, so that frames leave close to the end of their latency.
         for count, _ in enumerate(_paced(shared, 1.0 / params.tracker.rate / 4)):
@@ -383,4 +366,5 @@ def _tracker(part: _Part) -> None:
                 cameras.step(float(taken[0]), int(number[0]), ball if in_play[0] else None)
             for datagram in cameras.due(now):
                 network.send(datagram, now)
-            _send(wire, network.due(now), part.ports.tracker)
+            for datagram in network.due(now):
+                wire.send(datagram, (HOST, part.ports.tracker))

@@ -9,11 +9,14 @@ import struct
 import numpy as np
 import pytest
 
+from robot_io.contract import PAPER
 from robot_io.devices.festo import AxisCommand, AxisLost, CmmtProfile, FhppProfile, ModbusLink
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_drive import DriveParams, Power
 from robot_io.emulator.axis_motion import advance, brake
 from robot_io.emulator.axis_server import AxisServer
+from robot_io.emulator.config import RigParams, drives_of
+from robot_io.emulator.hidden import HiddenErrors
 from tests.support.axes_lockstep import PROFILES, LockStep, Stream
 
 A, V = 15.0, 2.0  # [m/s^2], [m/s]
@@ -285,6 +288,14 @@ def test_registers_that_there_are():
     assert cmmt.images == fhpp.images == 0
     with pytest.raises(ValueError, match="available are cmmt, fhpp"):
         AxisEmulator("cia402")
+
+
+@pytest.mark.parametrize(("profile", "unit"), [("cmmt", 1e-6), ("fhpp", 1e-5)])
+def test_a_hidden_base_velocity_leaves_the_unit_of_positions(profile, unit):
+    params = RigParams(axis_profile=profile, hidden=HiddenErrors(base_velocity=1.5))
+    assert {(drive.bank.units.position, drive.bank.units.base_velocity) for drive in drives_of(params, PAPER)} == {
+        (unit, 1.5)
+    }
 
 
 # Over real sockets
