@@ -169,7 +169,7 @@ class ArmController:
             joint = int(np.argmax(outside | too_fast))
             self.stop_egm(
                 f"EGM stopped: reference of arm joint {joint + 1} out of range, position {message.position[joint]:.4g} "
-                f"rad, speed {message.velocity[joint]:.4g} rad/s",
+                f"rad, speed {message.velocity[joint]:.4g} rad/s"
             )
             return self._refuse("out_of_range")
         if len(self._queue) >= self.params.queue_length:
@@ -224,14 +224,14 @@ class ArmController:
             joint = int(np.argmax(outside))
             self.motors_off(
                 f"motors switched off: arm joint {joint + 1} is at {position[joint]:.4f} rad, outside "
-                f"[{self.params.lower[joint]:.4f}, {self.params.upper[joint]:.4f}] rad",
+                f"[{self.params.lower[joint]:.4f}, {self.params.upper[joint]:.4f}] rad"
             )
         elif too_fast.any():
             joint = int(np.argmax(too_fast))
             limit = self.params.overspeed * self._max_speed[joint]
             self.motors_off(
                 f"motors switched off: arm joint {joint + 1} moves at {velocity[joint]:.3f} rad/s, "
-                f"limit {limit:.3f} rad/s",
+                f"limit {limit:.3f} rad/s"
             )
 
     def _feedback(self, now: float, position: np.ndarray) -> bytes | None:

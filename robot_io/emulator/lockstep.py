@@ -79,12 +79,7 @@ class LockStep:
         self.arm = ArmController(BRIDGE, arm_params)
         self.emulators = drives_of(params, contract)
         axes = [
-            Axis(
-                contract.joints[i],
-                emulator,
-                PROFILES[params.axis_profile](),
-                *axis_range(i, safety, contract.limits),
-            )
+            Axis(contract.joints[i], emulator, PROFILES[params.axis_profile](), *axis_range(i, safety, contract.limits))
             for i, emulator in zip(contract.carrying, self.emulators, strict=True)
         ]
         self.axes: FestoAxes | FixedBase = FestoAxes(axes) if axes else FixedBase()

@@ -312,11 +312,7 @@ def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjM
         mass=0.0,
         group=3,
     )
-    restitutions = {
-        "col_table": params.table_restitution,
-        "net": NET[0],
-        "rig_paddle": params.paddle_restitution,
-    }
+    restitutions = {"col_table": params.table_restitution, "net": NET[0], "rig_paddle": params.paddle_restitution}
     for name, restitution in restitutions.items():
         damping = damping_for(restitution, STIFFNESS, params.timestep / FINE)
         spec.add_pair(geomname1="ball", geomname2=name, condim=1, solref=[-STIFFNESS, -damping], solimp=SOLIMP)

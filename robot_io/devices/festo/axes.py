@@ -313,8 +313,7 @@ class FestoAxes:
         if status.fault and not self._acknowledging:
             channel.on = False
             self._latch(
-                "drive_fault",
-                f"{axis.name} has a fault, {channel.fault_text}. Remove the cause, then acknowledge it.",
+                "drive_fault", f"{axis.name} has a fault, {channel.fault_text}. Remove the cause, then acknowledge it."
             )
         elif channel.on and channel.was_enabled and not status.enabled:
             channel.on = False
