@@ -787,7 +787,7 @@ class RealTime:
         # Generous times: what is tested is the order of things, on a machine that may be busy.
         config = AxesConfig(node_guard=1.0, command_timeout=0.5, state_timeout=0.5)
         links = [ModbusLink("127.0.0.1", s.port, timeout=0.5) for s in self.servers]
-        return FestoAxes([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links, strict=True)], config)
+        return AxesThread([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links, strict=True)], config)
 
 
 def wait_for(condition, seconds=10.0):
@@ -801,7 +801,7 @@ def wait_for(condition, seconds=10.0):
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp"])
 def test_over_tcp_in_real_time(profile):
     with RealTime(profile) as rig:
-        with AxesThread(rig.axes()) as thread:
+        with rig.axes() as thread:
             wait_for(lambda: thread.state is not None)
             thread.enable()
             wait_for(lambda: thread.state.enabled)
@@ -825,15 +825,14 @@ def test_over_tcp_in_real_time(profile):
 def test_thread_stops_the_axes_when_it_breaks(broken):
     """An error that nobody thought of, in one axis's exchange: the other is stopped and switched off."""
     with RealTime() as rig:
-        axes = rig.axes()
-        with AxesThread(axes) as thread:
+        with rig.axes() as thread:
             thread.enable()
             wait_for(lambda: thread.state is not None and thread.state.enabled)
 
             def exchange(*arguments):
                 raise ZeroDivisionError("unforeseen")
 
-            axes._channels[broken].axis.link.exchange = exchange
+            thread._channels[broken].axis.link.exchange = exchange
             wait_for(lambda: "broke off (ZeroDivisionError: unforeseen)" in (thread.problem(time.monotonic()) or ""))
             wait_for(lambda: not rig.emulators[1 - broken].drive.operating, seconds=0.9)  # before its node guard
             assert "restart the program" in thread.problem(time.monotonic())
