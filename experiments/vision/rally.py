@@ -16,8 +16,7 @@ from experiments.vision.rendered_rig import RenderedCameras
 from mjx_tt.sim.model import SimModel
 from robot_io.control.interfaces import STANDARD_PLAY
 from robot_io.emulator.lockstep import LockStep
-from robot_io.emulator.tracker import TrackerParams
-from robot_io.emulator.tracker.cameras import CameraParams
+from robot_io.emulator.tracker import CameraParams, TrackerParams
 from robot_io.policy.artefact import Artefact
 from robot_io.vision.rig import CameraRig
 from robot_io.vision.tracker import TrackedBall
@@ -71,7 +70,7 @@ def play(
     played = Played()
     rendered = RenderedCameras(rig, detector, watch=_watcher(played, rig) if pixels else None)
     config = replace(STANDARD_PLAY, contract=robot.contract)
-    lock_step = LockStep(robot.scene(), thrown, artefact.streaming(), params, config, rendered=rendered)
+    lock_step = LockStep(robot.scene(), thrown, artefact.streaming(), params, config, rendered=rendered.open)
     lock_step.start()
     while len(played.outcomes) < balls and (found := lock_step.play(1)):
         played.outcomes.append(found[0].outcome)

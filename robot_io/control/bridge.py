@@ -36,7 +36,8 @@ from robot_io.control.observation import Feedback, blade, joints, observe
 from robot_io.control.play import Play
 from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.arm_history import ArmHistory
-from robot_io.devices.egm.session import ArmFeedback, EgmSession
+from robot_io.devices.egm.messages import ArmFeedback
+from robot_io.devices.egm.session import EgmSession
 from robot_io.devices.frame_check import FrameCheck
 from robot_io.devices.tracker import Tracker
 from robot_io.errors import RefusedError, format_error

@@ -11,11 +11,11 @@ from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
 from robot_io.control.observation import ObservationDelays
 from robot_io.devices.egm.messages import N_ARM_JOINTS
-from robot_io.devices.festo import AxesConfig, Axis, AxisProfile, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
+from robot_io.devices.festo import AxesConfig, AxesThread, Axis, AxisProfile, CmmtProfile, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.safety.config import SafetyConfig
 
-PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
+PROFILES: dict[str, type[CmmtProfile] | type[FhppProfile]] = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
@@ -171,7 +171,7 @@ def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tu
     return limits.lower[i] + room, limits.upper[i] - room
 
 
-def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> FestoAxes:
+def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> AxesThread:
     """The axes behind their Modbus connections, which the first exchange opens."""
     axes = []
     for i, axis in zip(contract.carrying, config.axes, strict=True):
@@ -181,4 +181,4 @@ def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> FestoAxes:
         axes.append(Axis(contract.joints[i], link, profile, low, high, zero=axis.zero, direction=axis.direction))
     # The gate proves the way of a command that no other one follows for no longer than that.
     timeout = min(config.axes_motion.command_timeout, config.safety.late)
-    return FestoAxes(axes, replace(config.axes_motion, command_timeout=timeout))
+    return AxesThread(axes, replace(config.axes_motion, command_timeout=timeout))

@@ -28,7 +28,6 @@ from robot_io.control.interfaces import ControlOptions as ControlOptions
 from robot_io.control.owner import Owner
 from robot_io.control.timings import Timings
 from robot_io.devices.egm.session import EgmConfig, EgmSession
-from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker
 from robot_io.devices.udp import UdpSocket
@@ -119,7 +118,7 @@ class Control:
                 if options.dry
                 else None
             )
-            self._axes = opened(closing(axes or AxesThread(linear_axes(config, contract))))
+            self._axes = opened(closing(axes or linear_axes(config, contract)))
             beyond = config.axes_motion.overtravel
             play = BridgeConfig(
                 config.delays,

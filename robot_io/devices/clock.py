@@ -46,15 +46,15 @@ class Clock:
         self._least: tuple[float, float] | None = None
         self._began = -math.inf
         self._missed, self._set_back, self._jumped = 0, 0, False
-        self.drift, self._level, self._at = self._nominal or 0.0, self._given, 0.0
+        self.drift, self._at = self._nominal or 0.0, 0.0
         self.windows = 0  # complete ones
         self.measured, self.residual = 0.0, 0.0  # [s] offset by the frames, and how far seconds miss the line
 
     def offset(self, captured: float) -> float | None:
         """Offset [s] at a capture on the tracker's clock; None while it is not known."""
-        if self._level is None or not self._corrects or not self.windows:
-            return self._level
-        return self._level + self.drift * (captured - self._at)
+        if self._corrects and self.windows:
+            return self.measured + self.drift * (captured - self._at)
+        return self._given
 
     def add(self, captured: float, now: float) -> bool:
         """Take a frame's capture [s, tracker's clock] and arrival [s, bridge's]; True when a second was completed."""
@@ -83,7 +83,7 @@ class Clock:
         if self._floor is None:  # the configured offset holds at the start: what is over is the frames' latency
             self._floor = delay - (self._given or 0.0)
         if self.windows >= SETTLED:
-            expected = self._line(captured)
+            expected = self.measured + self._floor + self.drift * (captured - self._at)
             self._missed = self._missed + 1 if abs(delay - expected) > STEP * self._bound else 0
             if 0 < self._missed < ONE_OFF:
                 return  # one slow second tells nothing about the clocks
@@ -99,13 +99,8 @@ class Clock:
             self.drift = float(np.median((delays[j] - delays[i]) / (times[j] - times[i])))
         level = float(np.median(delays - self.drift * (times - captured)))
         self._at = captured
-        if self._corrects:
-            self._level = level - self._floor
         self.measured = level - self._floor
         self.residual = float(np.sqrt(np.mean((delays - self.drift * (times - captured) - level) ** 2)))
-
-    def _line(self, captured: float) -> float:
-        return self.measured + (self._floor or 0.0) + self.drift * (captured - self._at)
 
     def report(self) -> dict[str, float]:
         """Everything that was measured, for the log."""

@@ -26,10 +26,6 @@ class FixedBase:
     def state(self) -> FixedBase:
         return self
 
-    @property
-    def axes(self) -> FixedBase:
-        return self
-
     def cycle(self, now: float) -> None:
         self.received = now
 

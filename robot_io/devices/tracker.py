@@ -69,7 +69,7 @@ class Tracker:
         self._sequence: int | None = None
         self._port = config.source_port  # that frames are taken from
         self._far: int | None = None  # sequence number far ahead of the track's, not confirmed yet
-        self._outliers: list[BallSample] = []  # refused in a row; a track of their own when they agree
+        self._outliers: list[tuple[float, np.ndarray]] = []  # refused in a row; a track of their own when they agree
 
     def receive(self, datagram: bytes, source: str, now: float, port: int | None = None) -> BallSample | None:
         """Take one datagram from an IP address and port; the sample, or None when it was refused and counted."""
@@ -108,10 +108,11 @@ class Tracker:
         if sample.position is None:
             self.counts["accepted"] += 1
             return sample
-        new_track = sample.ball != self.ball
-        if not new_track and not self._reachable(sample):
+        new_track, newest, here = sample.ball != self.ball, self.track.newest, (captured, sample.position)
+        if not new_track and newest is not None and not _near(*newest, *here):
             self.counts["outlier"] += 1
-            self._outliers = [*self._outliers, sample] if self._agrees(sample) else [sample]
+            agrees = bool(self._outliers) and _near(*self._outliers[-1], *here)
+            self._outliers = [*self._outliers, here] if agrees else [here]
             if len(self._outliers) < AGREEING:
                 return None
             new_track = True  # it was the track that was wrong
@@ -171,17 +172,7 @@ class Tracker:
         self.counts["lost"] += ahead - 1
         return True
 
-    def _reachable(self, sample: BallSample) -> bool:
-        """True when a ball can have come here from the track's newest place."""
-        newest = self.track.newest
-        return newest is None or _near(newest[0], newest[1], sample)
 
-    def _agrees(self, sample: BallSample) -> bool:
-        last = self._outliers[-1] if self._outliers else None
-        return last is not None and last.position is not None and _near(last.captured, last.position, sample)
-
-
-def _near(time: float, place: np.ndarray, sample: BallSample) -> bool:
-    if sample.position is None:
-        return False
-    return float(np.linalg.norm(sample.position - place)) <= JUMP + FASTEST * (sample.captured - time)
+def _near(time: float, place: np.ndarray, later: float, there: np.ndarray) -> bool:
+    """True when a ball can have come there by then."""
+    return float(np.linalg.norm(there - place)) <= JUMP + FASTEST * (later - time)

@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from ballmodel.io.ranges import Within
-from robot_io.contract import ABB_JOINTS, LIMITS, PAPER, Contract
+from ballmodel.io.ranges import Within, check_fields
+from robot_io.contract import ABB_JOINTS, LIMITS
 from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor, encode_robot
-
-EVENTS_KEPT = 1000
+from robot_io.emulator.axis_motion import Past
 
 
 def _arm(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -73,70 +72,11 @@ class ArmParams:
         lengths = {len(values) for values in each.values()}
         count = N_ARM_JOINTS if N_ARM_JOINTS in lengths else min(lengths)
         for name, values in each.items():
-            if len(values) != count or not np.isfinite(values).all():
+            if len(values) != count:
                 raise ValueError(f"{name}: expected {count} finite numbers, got {values}")
-        for name in ("cycle", "low_pass", "comm_timeout", "queue_length"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("feedback_delay", "dead_time", "pos_corr_gain", "position_tolerance"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
-        if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
-            raise ValueError("stop_deceleration, max_speed: expected positive numbers; overspeed: expected at least 1")
+        check_fields(self)
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"lower: expected less than upper, {self.upper}, in each joint, got {self.lower}")
-
-
-def for_robot(params: ArmParams, contract: Contract) -> ArmParams:
-    """The same controller with the joints of another robot's arm; it stops them as fast as they may accelerate.
-
-    Raises ValueError where the parameters give the joints limits of their own: another robot's are the contract's.
-    """
-    if contract == PAPER:
-        return params
-    limits, standard = contract.limits, ArmParams()
-    own = {
-        name: tuple(values[i] for i in contract.arm)
-        for name, values in (
-            ("stop_deceleration", limits.acceleration),
-            ("lower", limits.lower),
-            ("upper", limits.upper),
-            ("max_speed", limits.velocity),
-        )
-    }
-    for name, values in own.items():
-        if getattr(params, name) not in (getattr(standard, name), values):
-            raise ValueError(
-                f"arm.{name} is {getattr(params, name)}, allowed is nothing: those of {contract.robot} are its YAML's"
-            )
-    return replace(params, **own)  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True)
-class ArmEvent:
-    """Something that the controller's log would show: ``now`` of the last step, a short name, a sentence."""
-
-    time: float
-    name: str
-    sentence: str
-
-
-@dataclass
-class ArmStatistics:
-    """Counters since power-on.
-
-    cycles    calls of ``step``
-    received  datagrams given to ``receive``
-    rejected  of those, by reason: stranger, not_running, queue_full, out_of_range or an ``EgmError.reason``
-    consumed  messages that became the reference
-    starved   cycles with EGM running and no message queued
-    """
-
-    cycles: int = 0
-    received: int = 0
-    rejected: Counter = field(default_factory=Counter)
-    consumed: int = 0
-    starved: int = 0
 
 
 class ArmStateError(RuntimeError):
@@ -148,53 +88,52 @@ class ArmController:
 
     Starts with motors off. An operator calls ``motors_on``, ``start_rapid``, ``start_egm``; ``motors_off`` is the
     emergency stop. ``motors_on()`` and the like return nothing and raise ArmStateError where they are not allowed.
+
+    cause     of the last stop, a sentence; None while EGM runs or before anything happened
+    rejected  datagrams by reason: stranger, not_running, queue_full, out_of_range or an ``EgmError.reason``
     """
 
     def __init__(self, client: tuple[str, int], params: ArmParams = ArmParams()):
         self.client = (client[0], client[1])
         self.params = params
-        self.statistics = ArmStatistics()
-        self.events: deque[ArmEvent] = deque(maxlen=EVENTS_KEPT)
+        self.cause: str | None = None
+        self.rejected: Counter[str] = Counter()
         self.motors_are_on = self.rapid_is_running = self.egm_is_running = False
         self._queue: deque = deque()
-        self._history: deque[tuple[float, np.ndarray]] = deque()  # measured positions, back to feedback_delay ago
+        self._past = Past(params.feedback_delay)  # measured positions
         self._sequence = 0
         self._now: float | None = None
         self._velocity: np.ndarray = np.zeros(len(params.lower))
         self._reference: _Reference | None = None  # while EGM runs, from the first step on
         self._last_message = 0.0
-        self._deceleration = np.array(params.stop_deceleration)
-        self._max_speed = np.array(params.max_speed)
-        self._egm_began: float | None = None
+        self._deceleration, self._max_speed = np.array(params.stop_deceleration), np.array(params.max_speed)
+        self._egm_began = 0.0
         self._lower = np.array(params.lower) - params.position_tolerance
         self._upper = np.array(params.upper) + params.position_tolerance
 
-    @property
-    def cause(self) -> str | None:
-        """Sentence of the last stop, None while EGM runs or before anything happened."""
-        stops = [event.sentence for event in self.events if event.name not in ("motors_on", "rapid_start", "egm_start")]
-        return None if self.egm_is_running or not stops else stops[-1]
+    def switch_on(self) -> None:
+        """Motors, RAPID and EGM, as a person does it; EGM not while the arm still brakes: ArmStateError."""
+        self.motors_on()
+        self.start_rapid()
+        self.start_egm()
 
     def motors_on(self) -> None:
         self.motors_are_on = True
-        self._log("motors_on", "motors switched on")
 
-    def motors_off(self, name: str = "motors_off", sentence: str = "motors switched off: emergency stop") -> None:
+    def motors_off(self, cause: str = "motors switched off: emergency stop") -> None:
         """Stops the arm, RAPID and EGM; allowed in every state."""
-        self._log(name, sentence)
-        self.motors_are_on = self.rapid_is_running = False
-        self._end_egm()
+        self.motors_are_on = False
+        self.stop_rapid(cause)
 
     def start_rapid(self) -> None:
         if not self.motors_are_on:
             raise ArmStateError("RAPID cannot start with the motors off: call motors_on() first")
         self.rapid_is_running = True
-        self._log("rapid_start", "RAPID started")
 
-    def stop_rapid(self) -> None:
-        self._log("rapid_stop", "RAPID stopped by the operator")
+    def stop_rapid(self, cause: str = "RAPID stopped by the operator") -> None:
+        """Stops the arm, RAPID and EGM; the motors stay on."""
         self.rapid_is_running = False
-        self._end_egm()
+        self.stop_egm(cause)
 
     def start_egm(self) -> None:
         """A new EGM session: sequence numbers begin at 0, the reference is where the arm stands."""
@@ -202,15 +141,14 @@ class ArmController:
             raise ArmStateError("EGM cannot start while RAPID is stopped: call start_rapid() first")
         if self._velocity.any():
             raise ArmStateError("EGM cannot start while the arm still brakes: step until the velocity is zero")
-        self._end_egm()
+        self.stop_egm(None)
         self.egm_is_running = True
         self._sequence = 0
-        self._log("egm_start", "EGM started")
 
-    def stop_egm(self, name: str = "egm_stop", sentence: str = "EGM stopped by the operator") -> None:
+    def stop_egm(self, cause: str | None = "EGM stopped by the operator") -> None:
         """Stops the arm and EGM; RAPID goes on."""
-        self._log(name, sentence)
-        self._end_egm()
+        self.cause, self.egm_is_running, self._reference = cause, False, None
+        self._queue.clear()
 
     def receive(self, datagram: bytes, source: tuple[str, int], now: float) -> bool:
         """Queues one EgmSensor; True when it was taken. No content makes it raise.
@@ -218,7 +156,6 @@ class ArmController:
         Position and speed are both required: half a message never moves the arm. A reference outside the joint range or
         beyond the overspeed limit ends EGM, as on the real controller.
         """
-        self.statistics.received += 1
         if (source[0], source[1]) != self.client:
             return self._refuse("stranger")
         if not self.egm_is_running:
@@ -227,14 +164,12 @@ class ArmController:
             message = decode_sensor(datagram, len(self.params.lower))
         except EgmError as error:
             return self._refuse(error.reason)
-        outside = (message.position < self._lower) | (message.position > self._upper)
-        outside |= np.abs(message.velocity) > self.params.overspeed * self._max_speed
-        if outside.any():
-            joint = int(np.argmax(outside))
+        outside, too_fast = self._beyond(message.position, message.velocity)
+        if (outside | too_fast).any():
+            joint = int(np.argmax(outside | too_fast))
             self.stop_egm(
-                "reference_out_of_range",
                 f"EGM stopped: reference of arm joint {joint + 1} out of range, position {message.position[joint]:.4g} "
-                f"rad, speed {message.velocity[joint]:.4g} rad/s",
+                f"rad, speed {message.velocity[joint]:.4g} rad/s"
             )
             return self._refuse("out_of_range")
         if len(self._queue) >= self.params.queue_length:
@@ -257,7 +192,6 @@ class ArmController:
             raise ValueError(f"time must advance: step at {now} s after {self._now} s")
         elapsed = self.params.cycle if self._now is None else now - self._now
         self._now = now
-        self.statistics.cycles += 1
         self._supervise(position, velocity)
         if self.egm_is_running and self._reference is None:
             self._reference = _Reference(now, position, self.params)
@@ -265,10 +199,10 @@ class ArmController:
         datagram = self._feedback(now, position)
         if self._reference is not None:
             self._take_message(now, self._reference)
-        if self._reference is not None:
+        if self._reference is not None:  # it still runs
             speed, target = self._reference.at(now)
             wanted = speed + self.params.pos_corr_gain * (target - position)
-            if self._egm_began is not None and now < self._egm_began + self.params.ramp_in:
+            if now < self._egm_began + self.params.ramp_in:
                 wanted = wanted * ((now - self._egm_began) / self.params.ramp_in)
             allowed = np.minimum(self._max_speed, self.params.max_speed_deviation)
             self._velocity = np.minimum(np.maximum(wanted, -allowed), allowed)
@@ -277,36 +211,32 @@ class ArmController:
             self._velocity = self._velocity - np.minimum(np.maximum(self._velocity, -step), step)
         return self._velocity.copy(), datagram
 
+    def _beyond(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joints (6,) outside their ranges, and above the overspeed limit."""
+        outside = (position < self._lower) | (position > self._upper)
+        return outside, np.abs(velocity) > self.params.overspeed * self._max_speed
+
     def _supervise(self, position: np.ndarray, velocity: np.ndarray) -> None:
         if not self.motors_are_on:
             return
-        outside = (position < self._lower) | (position > self._upper)
-        too_fast = np.abs(velocity) > self.params.overspeed * self._max_speed
+        outside, too_fast = self._beyond(position, velocity)
         if outside.any():
             joint = int(np.argmax(outside))
             self.motors_off(
-                "position_out_of_range",
                 f"motors switched off: arm joint {joint + 1} is at {position[joint]:.4f} rad, outside "
-                f"[{self.params.lower[joint]:.4f}, {self.params.upper[joint]:.4f}] rad",
+                f"[{self.params.lower[joint]:.4f}, {self.params.upper[joint]:.4f}] rad"
             )
         elif too_fast.any():
             joint = int(np.argmax(too_fast))
             limit = self.params.overspeed * self._max_speed[joint]
             self.motors_off(
-                "overspeed",
                 f"motors switched off: arm joint {joint + 1} moves at {velocity[joint]:.3f} rad/s, "
-                f"limit {limit:.3f} rad/s",
+                f"limit {limit:.3f} rad/s"
             )
 
     def _feedback(self, now: float, position: np.ndarray) -> bytes | None:
-        history, wanted = self._history, now - self.params.feedback_delay
-        history.append((now, position))
-        while len(history) > 1 and history[1][0] <= wanted:
-            history.popleft()
-        reported = history[0][1]
-        if len(history) > 1 and wanted > history[0][0]:
-            (before, start), (after, end) = history[0], history[1]
-            reported = start + (wanted - before) / (after - before) * (end - start)
+        self._past.add(now, *position.tolist())
+        reported = self._past.at(now - self.params.feedback_delay)
         if not (self.egm_is_running or self.params.stream_always):
             return None
         planned = position if self._reference is None else self._reference.target
@@ -318,26 +248,16 @@ class ArmController:
     def _take_message(self, now: float, reference: _Reference) -> None:
         if self._queue:
             message = self._queue.popleft()
-            reference.push(now + self.params.dead_time, message.velocity, message.position)
+            reference.coming.append((now + self.params.dead_time, message.velocity, message.position))
             self._last_message = now
-            self.statistics.consumed += 1
             return
-        self.statistics.starved += 1
         silence = now - self._last_message
         if silence >= self.params.comm_timeout - 1e-9:  # sums of cycle times are not exact
-            self.stop_egm("comm_timeout", f"EGM stopped: no message for {silence:.3f} s")
-
-    def _end_egm(self) -> None:
-        self.egm_is_running = False
-        self._reference = None
-        self._queue.clear()
+            self.stop_egm(f"EGM stopped: no message for {silence:.3f} s")
 
     def _refuse(self, reason: str) -> bool:
-        self.statistics.rejected[reason] += 1
+        self.rejected[reason] += 1
         return False
-
-    def _log(self, name: str, sentence: str) -> None:
-        self.events.append(ArmEvent(self._now or 0.0, name, sentence))
 
 
 class _Reference:
@@ -349,19 +269,17 @@ class _Reference:
 
     def __init__(self, now: float, position: np.ndarray, params: ArmParams):
         self.target = position  # (6,) [rad]
+        # When speed (6,) [rad/s] and target take effect.
+        self.coming: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self._decay = 2.0 * math.pi * params.low_pass
         self._time = now
         self._input: np.ndarray = np.zeros_like(position)
         self._filtered: np.ndarray = np.zeros_like(position)
-        self._coming: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
-
-    def push(self, due: float, speed: np.ndarray, target: np.ndarray) -> None:
-        self._coming.append((due, speed, target))
 
     def at(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Filtered speed (6,) [rad/s] and position reference (6,) [rad] in force at ``now``."""
-        while self._coming and self._coming[0][0] <= now:
-            due, speed, target = self._coming.popleft()
+        while self.coming and self.coming[0][0] <= now:
+            due, speed, target = self.coming.popleft()
             self._advance(due)
             self._input, self.target = speed, target
         self._advance(now)

@@ -49,12 +49,10 @@ class Drive:
 
     def __init__(self, params: DriveParams) -> None:
         self.params = params
-        self.power = Power.INHIBITED
-        self.fault_code = 0
-        self.homed = False
-        self.homing = False
+        self.power, self.fault_code = Power.INHIBITED, 0
+        self.homed = self.homing = False
         self.task = False  # a positioning task is active
-        self.paused = False
+        self.paused = False  # brakes and keeps the task
         self.target = 0.0
         self.origin: float | None = None  # the plant's position that is reported as 0
         self.x = self.v = 0.0  # generated
@@ -71,6 +69,11 @@ class Drive:
     @property
     def operating(self) -> bool:
         return self.power is Power.OPERATING
+
+    @property
+    def powered(self) -> bool:
+        """It has power, be it that it brakes to switch off."""
+        return self.power in (Power.OPERATING, Power.SWITCHING_OFF)
 
     @property
     def reached(self) -> bool:
@@ -100,26 +103,19 @@ class Drive:
         if self.power is not Power.SWITCHING_OFF:
             self.power = Power.INHIBITED
 
-    def home(self) -> bool:
-        """Starts homing; False when the drive cannot now."""
-        if not self.operating or self.v != 0.0:
-            return False
-        self.homing, self.homed, self.task = True, False, False
-        self._until = self._now + self.params.homing_time
-        return True
+    def home(self) -> None:
+        """Starts homing; nothing where the drive cannot now."""
+        if self.operating and self.v == 0.0:
+            self.homing, self.homed, self.task = True, False, False
+            self._until = self._now + self.params.homing_time
 
-    def abort_homing(self) -> None:
-        self.homing = False
-
-    def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> bool:
-        """A positioning task (reported coordinate); False if refused: not operating, homing, absolute and not homed."""
-        if not self.operating or self.homing or not (self.homed or relative) or acceleration <= 0.0:
-            return False
-        self.target = self.x + target if relative else target + (self.origin or 0.0)
-        self._speed = min(max(speed, 0.0), self.params.speed)
-        self.acceleration = min(acceleration, self.params.acceleration)
-        self.task, self.paused = True, False
-        return True
+    def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> None:
+        """A positioning task (reported coordinate); refused where not operating, homing, absolute and not homed."""
+        if self.operating and not self.homing and (self.homed or relative) and acceleration > 0.0:
+            self.target = self.x + target if relative else target + (self.origin or 0.0)
+            self._speed = min(max(speed, 0.0), self.params.speed)
+            self.acceleration = min(acceleration, self.params.acceleration)
+            self.task, self.paused = True, False
 
     def halt(self) -> None:
         """Brakes and drops the task."""
@@ -127,19 +123,12 @@ class Drive:
             self._restart(self._position, self._velocity)
         self.task = False
 
-    def pause(self) -> None:
-        """Brakes and keeps the task until ``resume``."""
-        self.paused = True
-
-    def resume(self) -> None:
-        self.paused = False
-
     def measure(self, position: float, velocity: float) -> None:
         """Position and velocity of the plant, at which the generator starts when the drive gets power."""
         self._position, self._velocity = position, velocity
         if self.origin is None:
             self.origin = position
-        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+        if not self.powered:
             self.x, self.v = position, 0.0
 
     def step(self, now: float) -> None:
@@ -151,7 +140,7 @@ class Drive:
             self.power = Power.OPERATING
         if self.power is Power.OPERATING and self.task and not self.paused:
             self.x, self.v = advance(self.x, self.v, self.target, self._speed, self.acceleration, dt)
-        elif self.power in (Power.OPERATING, Power.SWITCHING_OFF):
+        elif self.powered:
             self.x, self.v = brake(self.x, self.v, self.params.acceleration, dt)
         if self.power is Power.SWITCHING_OFF and self.v == 0.0:
             self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED
@@ -172,7 +161,7 @@ class Drive:
         if window > 0.0:
             earlier, area = self._past.at(self._now - window)
             x, v = (self._area - area) / window, (self.x - earlier) / window
-        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+        if not self.powered:
             return 0.0
         error = x - self._position
         if abs(error) > self.params.following_error:
@@ -189,7 +178,7 @@ class Drive:
 
     def _switch_off(self) -> None:
         self.task = self.homing = False
-        if self.power in (Power.OPERATING, Power.SWITCHING_OFF) and self.v != 0.0:
+        if self.powered and self.v != 0.0:
             self.power = Power.SWITCHING_OFF
         elif self.power is not Power.INHIBITED:
             self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED

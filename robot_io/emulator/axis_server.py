@@ -6,7 +6,8 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable
-from typing import Protocol, cast
+from contextlib import suppress
+from typing import cast
 
 from pymodbus.constants import ExcCodes
 from pymodbus.pdu import ModbusPDU
@@ -15,6 +16,8 @@ from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import ModbusProtocol
+
+from robot_io.emulator.axes import AxisEmulator
 
 WATCH = 0.02  # [s] between looks at whether the connection is to be dropped
 READ, WRITE = (3,), (6, 16)  # function codes; 23 does both
@@ -30,28 +33,20 @@ IDENTITY = {
 }
 
 
-class RegisterBank(Protocol):
-    """Part of ``robot_io.emulator.axes.AxisEmulator`` that a server needs."""
-
-    disconnected: bool
-    guard_tripped: bool
-
-    @property
-    def ranges(self) -> tuple[tuple[int, int], ...]: ...
-    def read(self, address: int, count: int) -> list[int]: ...
-    def write(self, address: int, values: list[int]) -> None: ...
-    def readable(self, address: int, count: int) -> bool: ...
-
-
 class AxisServer:
-    """Serves in a thread of its own from construction to ``close``. ``port`` is the one that was taken."""
+    """Serves an axis in a thread of its own from construction to ``close``.
 
-    def __init__(self, bank: RegisterBank, host: str, port: int, device_id: int) -> None:
+    port     the one that was taken; 0 takes a free one
+    refused  connections beyond the first
+
+    Raises OSError when it cannot listen.
+    """
+
+    def __init__(self, axis: AxisEmulator, host: str = "127.0.0.1", port: int = 0, device_id: int = 1) -> None:
         if not 1 <= device_id <= 255:
             raise ValueError(f"device_id {device_id} must be in 1..255; 0 would answer to every id")
-        self.port = port
-        self.refused = 0  # connections beyond the first
-        self._bank, self._host, self._device_id = bank, host, device_id
+        self.port, self.refused = port, 0
+        self._axis, self._host, self._device_id = axis, host, device_id
         self._loop = asyncio.new_event_loop()
         self._started = threading.Event()
         self._error: Exception | None = None
@@ -86,19 +81,11 @@ class AxisServer:
             self._loop.close()
 
     async def _serve(self) -> None:
-        device = SimDevice(
-            id=self._device_id,
-            simdata=[
-                SimData(low, values=[0] * (high - low), datatype=DataType.REGISTERS) for low, high in self._bank.ranges
-            ],
-            action=self._action,
-        )
-        server = _SingleConnectionServer(
-            device,
-            (self._host, self.port),
-            self._check,
-            lambda: self._bank.disconnected,
-        )
+        blocks = [
+            SimData(low, values=[0] * (high - low), datatype=DataType.REGISTERS) for low, high in self._axis.bank.ranges
+        ]
+        device = SimDevice(id=self._device_id, simdata=blocks, action=self._action)
+        server = _SingleConnectionServer(self._axis, device, (self._host, self.port), self._check)
         await server.serve_forever(background=True)
         # What pymodbus declares as a transport is the server of asyncio while it listens.
         self.port = cast(asyncio.Server, server.transport).sockets[0].getsockname()[1]
@@ -106,12 +93,13 @@ class AxisServer:
         try:
             silent = False
             while not self._finish.is_set():
-                plugged, silent = silent and not self._bank.disconnected, self._bank.disconnected
-                if plugged or (self._bank.guard_tripped and not silent):
-                    self._bank.guard_tripped = False
+                plugged, silent = silent and not self._axis.disconnected, self._axis.disconnected
+                if plugged or (self._axis.guard_tripped and not silent):
+                    self._axis.guard_tripped = False
                     server.drop()
                 self.refused = server.refused
-                await _wait(self._finish, WATCH)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._finish.wait(), WATCH)
         finally:
             server.drop()
             await server.shutdown()
@@ -122,12 +110,9 @@ class AxisServer:
 
         pymodbus would write first and complain about the address to read afterwards.
         """
-        if (
-            not sending
-            and isinstance(pdu, ReadWriteMultipleRegistersRequest)
-            and not self._bank.readable(pdu.read_address, pdu.read_count)
-        ):
-            pdu.write_registers = []
+        if isinstance(pdu, ReadWriteMultipleRegistersRequest) and not sending:
+            if not self._axis.bank.readable(pdu.read_address, pdu.read_count):
+                pdu.write_registers = []
         return pdu
 
     async def _action(
@@ -143,9 +128,9 @@ class AxisServer:
         try:
             if values is not None and function in (*WRITE, READ_WRITE):
                 if values:
-                    self._bank.write(address, [int(v) for v in values])
+                    self._axis.write(address, [int(v) for v in values])
             elif function in (*READ, READ_WRITE):
-                registers[address - start : address - start + count] = self._bank.read(address, count)
+                registers[address - start : address - start + count] = self._axis.read(address, count)
             else:
                 return ExcCodes.ILLEGAL_FUNCTION
         except ConnectionError:
@@ -154,27 +139,28 @@ class AxisServer:
 
 
 class _SingleConnectionServer(ModbusTcpServer):
-    """disconnected: tells whether the cable is out. Then nothing is answered, and what arrives does nothing."""
+    """While the axis's cable is out nothing is answered, and what arrives does nothing."""
 
     def __init__(
         self,
+        axis: AxisEmulator,
         device: SimDevice,
         address: tuple[str, int],
         trace_pdu: Callable[[bool, ModbusPDU], ModbusPDU],
-        disconnected: Callable[[], bool],
     ) -> None:
         def wire(sending: bool, data: bytes) -> bytes:
-            return b"" if sending and disconnected() else data
+            return b"" if sending and axis.disconnected else data
 
         identity = ModbusDeviceIdentification(info_name=IDENTITY)
         super().__init__(device, address=address, identity=identity, trace_packet=wire, trace_pdu=trace_pdu)
-        self._disconnected, self._unanswered = disconnected, set[_Unanswered]()
-        self.refused = 0
+        self._axis, self.refused = axis, 0
+        self._unanswered: list[_Unanswered] = []
 
     def handle_new_connection(self) -> ModbusProtocol:
         """asyncio, the caller, needs no more than a protocol."""
-        if self._disconnected():  # the kernel has accepted it, which no cable does; it hears nothing of that
-            return cast(ModbusProtocol, _Unanswered(self._unanswered))
+        if self._axis.disconnected:  # the kernel has accepted it, which no cable does; it hears nothing of that
+            self._unanswered.append(_Unanswered())
+            return cast(ModbusProtocol, self._unanswered[-1])
         if self.active_connections:
             self.refused += 1
             return cast(ModbusProtocol, _Refusal())
@@ -183,8 +169,9 @@ class _SingleConnectionServer(ModbusTcpServer):
     def drop(self) -> None:
         for connection in list(self.active_connections.values()):
             connection.close()
-        for unanswered in list(self._unanswered):
-            unanswered.close()
+        while self._unanswered:
+            if transport := self._unanswered.pop().transport:
+                transport.abort()
 
 
 class _Refusal(asyncio.Protocol):
@@ -195,29 +182,9 @@ class _Refusal(asyncio.Protocol):
 
 
 class _Unanswered(asyncio.Protocol):
-    """A connection to a drive whose cable is out; one of ``all_of_them`` until it ends."""
+    """A connection to a drive whose cable is out."""
 
-    def __init__(self, all_of_them: set[_Unanswered]) -> None:
-        self._all = all_of_them
+    transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
-        self._all.add(self)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._all.discard(self)
-
-    def close(self) -> None:
-        self._transport.abort()
-
-
-async def _wait(event: asyncio.Event, seconds: float) -> None:
-    try:
-        await asyncio.wait_for(event.wait(), seconds)
-    except TimeoutError:
-        pass
-
-
-def serve(bank: RegisterBank, host: str = "127.0.0.1", port: int = 0, device_id: int = 1) -> AxisServer:
-    """Starts a server; port 0 takes a free one. Raises OSError when it cannot listen."""
-    return AxisServer(bank, host, port, device_id)
+        self.transport = cast(asyncio.Transport, transport)

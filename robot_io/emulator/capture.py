@@ -6,12 +6,13 @@ read by dpkt, an optional extra.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from robot_io.devices.egm.messages import EgmError, RobotMessage, decode_robot, decode_sensor
+from robot_io.devices.egm.messages import ArmFeedback, EgmError, decode_robot, decode_sensor
 from robot_io.emulator.arm import ArmController, ArmParams, ArmStateError
 
 ANSWERER = ("0.0.0.0", 0)  # stands for the computer that answered, wherever it was
@@ -26,7 +27,7 @@ class Capture:
     skipped   packets that are no EGM of either kind
     """
 
-    feedback: list[tuple[float, RobotMessage]]
+    feedback: list[tuple[float, ArmFeedback]]
     replies: list[tuple[float, bytes]]
     skipped: int
 
@@ -105,13 +106,9 @@ def replay(capture: Capture, params: ArmParams) -> np.ndarray:
         if np.isfinite(last):
             q = q + velocity * (time - last)
         if message.egm_running and not arm.egm_is_running:
-            arm.motors_on()
-            arm.start_rapid()
-            try:
-                arm.start_egm()
+            with suppress(ArmStateError):  # it still brakes
+                arm.switch_on()
                 q = message.position
-            except ArmStateError:  # it still brakes
-                pass
         elif arm.egm_is_running and not message.egm_running:
             arm.stop_egm()
         if time > last:

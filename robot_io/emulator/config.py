@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from ballmodel.io.ranges import Within, check_fields
-from robot_io.contract import Contract
-from robot_io.emulator import arm as arms
+from robot_io.contract import PAPER, Contract
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_drive import DriveParams
-from robot_io.emulator.axis_registers import AxisUnits
+from robot_io.emulator.axis_registers import REGISTERS
+from robot_io.emulator.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
-from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.world import WorldParams
 
 AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
@@ -52,18 +51,35 @@ STANDARD_RIG = RigParams()
 def drives_of(params: RigParams, contract: Contract) -> list[AxisEmulator]:
     """The drives of the linear axes."""
     dead_time = params.axis_dead_time + params.action_delay
-    base = params.hidden.base_velocity
-    units = None if base == NOTHING_HIDDEN.base_velocity else AxisUnits(1e-6, base_velocity=base)
+    units = replace(REGISTERS[params.axis_profile].units, base_velocity=params.hidden.base_velocity)
     made = params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive, units
     return [AxisEmulator(*made) for _ in contract.carrying]
 
 
 def for_robot(params: RigParams, contract: Contract) -> RigParams:
-    """The rig with a contract's joints. Raises ValueError naming what does not fit them."""
+    """The rig with a contract's joints, which its arm stops as fast as they may accelerate.
+
+    Raises ValueError naming what does not fit them: another robot's limits are the contract's alone.
+    """
     zeros, names = params.hidden.joint_zeros, [contract.joints[i] for i in contract.arm]
     if zeros != NOTHING_HIDDEN.joint_zeros and len(zeros) != len(names):
         raise ValueError(
             f"hidden.joint_zeros: expected {len(names)} entries for {contract.robot}, one for each of "
             f"{', '.join(names)}, got {len(zeros)}"
         )
-    return replace(params, arm=arms.for_robot(params.arm, contract))
+    if contract == PAPER:
+        return params
+    limits, standard = contract.limits, ArmParams()
+    own: dict[str, Any] = {
+        name: tuple(values[i] for i in contract.arm)
+        for name, values in (
+            ("stop_deceleration", limits.acceleration),
+            ("lower", limits.lower),
+            ("upper", limits.upper),
+            ("max_speed", limits.velocity),
+        )
+    }
+    for name, values in own.items():
+        if (given := getattr(params.arm, name)) not in (getattr(standard, name), values):
+            raise ValueError(f"arm.{name} is {given}, allowed is nothing: those of {contract.robot} are its YAML's")
+    return replace(params, arm=replace(params.arm, **own))

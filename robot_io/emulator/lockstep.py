@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,14 +20,14 @@ from robot_io.control.episode import EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY
 from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.session import EgmConfig, EgmSession
-from robot_io.devices.festo import Axis, DirectLink, FestoAxes
+from robot_io.devices.festo import Axis, FestoAxes
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerConfig
-from robot_io.emulator.arm import ArmController, ArmStateError
+from robot_io.emulator.arm import ArmController
 from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
-from robot_io.emulator.tracker import EmulatedTracker, TrackerEmulator, TrackerMaker
+from robot_io.emulator.tracker import EmulatedTracker, TrackerEmulator, TrackerParams
 from robot_io.emulator.world import World
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.log.recorder import SessionRecorder
@@ -51,7 +50,7 @@ class LockStep:
     config  of the bridge; its contract says which joints arm and axes have
     balls_needed  as of BridgeConfig; with the default the tracker, which nobody can move, counts as shown, and only
             balls that contradict it are heeded
-    rendered  makes the tracker where ``tracker.cameras`` is "rendered"
+    rendered  makes the tracker where ``tracker.cameras`` is "rendered"; the number is a seed
     """
 
     def __init__(
@@ -68,7 +67,7 @@ class LockStep:
         tracker: TrackerConfig = SAME_CLOCK,
         calibration: Calibration = UNCALIBRATED,
         balls_needed: int = 0,
-        rendered: TrackerMaker | None = None,
+        rendered: Callable[[TrackerParams, World, int], EmulatedTracker] | None = None,
     ) -> None:
         contract = config.contract
         self.params = params = for_robot(params, contract)
@@ -80,19 +79,14 @@ class LockStep:
         self.arm = ArmController(BRIDGE, arm_params)
         self.emulators = drives_of(params, contract)
         axes = [
-            Axis(
-                contract.joints[i],
-                DirectLink(emulator),
-                PROFILES[params.axis_profile](),
-                *axis_range(i, safety, contract.limits),
-            )
+            Axis(contract.joints[i], emulator, PROFILES[params.axis_profile](), *axis_range(i, safety, contract.limits))
             for i, emulator in zip(contract.carrying, self.emulators, strict=True)
         ]
         self.axes: FestoAxes | FixedBase = FestoAxes(axes) if axes else FixedBase()
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
         self.cameras: EmulatedTracker
         if rendered is not None and params.tracker.cameras == "rendered":
-            self.cameras = rendered.open(params.tracker, self.world, int(seed[0]))
+            self.cameras = rendered(params.tracker, self.world, int(seed[0]))
         else:
             self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
         self._to_bridge = Network(params.arm_network, int(seed[1]))
@@ -154,10 +148,9 @@ class LockStep:
         qpos, qvel = self.world.qpos, self.world.qvel
         abb = list(self._contract.arm)
         hidden = self.params.hidden
-        speed, datagram = self.arm.step(now, hidden.counted(qpos[abb]), hidden.ordered(qvel[abb]))
-        self._setpoint[abb] = hidden.to_joints(speed)
+        self._setpoint[abb], datagram = hidden.drive_arm(self.arm, now, qpos[abb], qvel[abb])
         for k, (i, emulator) in enumerate(zip(self._contract.carrying, self.emulators, strict=True)):
-            self._setpoint[i] = hidden.drive(k, emulator, now, float(qpos[i]), float(qvel[i]))
+            self._setpoint[i] = hidden.drive_axis(k, emulator, now, float(qpos[i]), float(qvel[i]))
         if datagram is not None and self.arm_connected:
             self._to_bridge.send(datagram, now)
 
@@ -190,9 +183,7 @@ class LockStep:
 
     def start(self) -> None:
         """Switch everything on, home the axes, arm the bridge. Raises RefusedError when it does not get ready."""
-        self.arm.motors_on()
-        self.arm.start_rapid()
-        self.arm.start_egm()
+        self.arm.switch_on()
         self.run(0.1)
         self.axes.enable()
         self.run(1.0, lambda: self.axes.state is not None and self.axes.state.enabled)
@@ -218,9 +209,8 @@ class LockStep:
 
         Raises RefusedError.
         """
-        for action in (self.arm.motors_on, self.arm.start_rapid):
-            with suppress(ArmStateError):  # it is so already
-                action()
+        self.arm.motors_on()
+        self.arm.start_rapid()
         self.run(0.2)  # an arm that still brakes cannot start EGM
         if not self.arm.egm_is_running:
             self.arm.start_egm()

@@ -37,21 +37,18 @@ class Network:
         self._perfect = faults == NetworkFaults()
 
     def send(self, datagram: bytes, now: float) -> None:
+        f, random = self._faults, self._random
         if self._perfect:
             return self._put(now, datagram)
-        f, random = self._faults, self._random
         if random.random() < f.loss:
-            return None
+            return
         for _ in range(2 if random.random() < f.duplication else 1):
-            content = datagram
+            content = bytearray(datagram)
             if datagram and random.random() < f.bit_flip:
                 place = int(random.integers(8 * len(datagram)))
-                flipped = bytearray(datagram)
-                flipped[place // 8] ^= 1 << place % 8
-                content = bytes(flipped)
+                content[place // 8] ^= 1 << place % 8
             late = f.delay + abs(random.normal()) * f.jitter + (f.hold if random.random() < f.reordering else 0.0)
-            self._put(now + late, content)
-        return None
+            self._put(now + late, bytes(content))
 
     def _put(self, when: float, datagram: bytes) -> None:
         heapq.heappush(self._heap, (when, self._count, datagram))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -35,35 +36,38 @@ class Throws:
             )
 
 
-def at_home(world: World) -> bool:
-    """True when the robot stands at its home pose."""
-    return bool((np.abs(world.qpos - world.home) < NEAR_HOME).all() and (np.abs(world.qvel) < STILL).all())
+class Quiet:
+    """Waits until the robot has stood at its home pose, with no ball in play, for ``pause`` [s]."""
+
+    def __init__(self, pause: float) -> None:
+        self._pause, self._since = pause, math.inf
+
+    def lasted(self, world: World, now: float) -> bool:
+        """One look at ``now`` [s]; True when it was quiet for so long, which then begins anew."""
+        away, moving = np.abs(world.qpos - world.home) >= NEAR_HOME, np.abs(world.qvel) >= STILL
+        self._since = math.inf if world.in_play or away.any() or moving.any() else min(self._since, now)
+        if self._since == math.inf or now - self._since < self._pause:
+            return False
+        self._since = math.inf
+        return True
 
 
 class Thrower:
-    """Throws one ball after the other, from the start again when all are thrown.
+    """Throws one ball after the other, from number ``first`` and from the start again when all are thrown.
 
     pause  [s] that robot and ball must have been still
     """
 
     def __init__(self, throws: Throws, pause: float = 0.6, first: int = 0) -> None:
-        self._throws, self._pause, self._next = throws, pause, first
-        self._quiet_since: float | None = None
+        self._throws, self._quiet, self._next = throws, Quiet(pause), first
         self.thrown = 0
 
-    def update(self, world: World, now: float) -> bool:
-        """Throws when it is time; True when it did."""
-        if world.in_play or not at_home(world):
-            self._quiet_since = None
-            return False
-        if self._quiet_since is None:
-            self._quiet_since = now
-        if now - self._quiet_since < self._pause:
-            return False
-        i = self._next % self._throws.position.shape[1]
-        world.throw(self._throws.position[:, i], self._throws.velocity[:, i], self._throws.spin[:, i])
-        self._next, self.thrown, self._quiet_since = i + 1, self.thrown + 1, None
-        return True
+    def update(self, world: World, now: float) -> None:
+        """Throws when it is time."""
+        if self._quiet.lasted(world, now):
+            i = self._next % self._throws.position.shape[1]
+            world.throw(self._throws.position[:, i], self._throws.velocity[:, i], self._throws.spin[:, i])
+            self._next, self.thrown = i + 1, self.thrown + 1
 
 
 @dataclass(frozen=True)
@@ -124,61 +128,46 @@ class Rallies:
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
         self._state = self._waiting
-        self._since: float | None = None
+        self._quiet = Quiet(self.pause)
         self._next_at = 0.0
         self._hit_at = self._struck_at = 0.0
         self._wish = (0.0, 0.0)
 
-    def update(self, world: World, now: float) -> bool:
-        """Serve or answer when it is time, by the world's own clock; True when the opponent struck the ball."""
-        return self._state(world, world.time)
+    def update(self, world: World, now: float) -> None:
+        """Serve or answer when it is time, by the world's own clock."""
+        self._state(world, world.time)
 
-    def _waiting(self, world: World, now: float) -> bool:
-        if self.patient:
-            if world.in_play or not at_home(world):
-                self._since = None
-                return False
-            self._since = now if self._since is None else self._since
-            if now - self._since < self.pause:
-                return False
-        elif now < self._next_at:
-            return False
-        self._since = None
-        ball = self.opponent.serve()
-        world.throw(ball.position, ball.velocity, ball.spin)
-        self.thrown += 1
-        self.played.append(PlayedRally(now))
-        self._state, self._struck_at = self._coming, now
-        return True
+    def _waiting(self, world: World, now: float) -> None:
+        if self._quiet.lasted(world, now) if self.patient else now >= self._next_at:
+            ball = self.opponent.serve()
+            world.throw(ball.position, ball.velocity, ball.spin)
+            self.thrown += 1
+            self.played.append(PlayedRally(now))
+            self._state, self._struck_at = self._coming, now
 
-    def _coming(self, world: World, now: float) -> bool:
+    def _coming(self, world: World, now: float) -> None:
         """The human's ball is on its way to the robot."""
         bounces = 0
         for time, name, place in world.touches:
-            if name == "rig_paddle":
-                if bounces != 1:
-                    return self._over(now)  # a volley
+            if name == "rig_paddle" and bounces == 1:
                 self.played[-1].touches += 1
-                self._hit_at, self._wish = time, self.opponent.wish()
-                self._state = self._returning
-                return False
-            if name == "col_table":
-                bounces += 1
-                if bounces > 1 or place[1] > 0.0:
-                    return self._over(now)
+                self._hit_at, self._wish, self._state = time, self.opponent.wish(), self._returning
+                return
+            bounces += name == "col_table"
+            if name == "rig_paddle" or bounces > 1 or (name == "col_table" and place[1] > 0.0):
+                return self._over(now)  # a volley, a second bounce, or one on the human's half
         _, y, z = world.ball
         if not world.in_play or y < BEHIND or z < BELOW or now - self._struck_at > LONGEST:
-            return self._over(now)
-        return False
+            self._over(now)
 
-    def _returning(self, world: World, now: float) -> bool:
+    def _returning(self, world: World, now: float) -> None:
         """The robot's return is on its way to the human."""
-        bounces = [(t, p) for t, name, p in world.touches if name == "col_table" and t > self._hit_at]
+        bounces = self._bounces(world)
         x, y, z = ball = world.ball
         if not world.in_play or len(bounces) > 1 or z < -0.76 or now - self._hit_at > LONGEST:
             return self._over(now)
         if not bounces:
-            return False
+            return
         bounced_at, landing = bounces[0]
         if landing[1] <= 0.0:
             return self._over(now)
@@ -187,29 +176,30 @@ class Rallies:
         velocity = world.ball_velocity
         fallen = z <= lowest and velocity[2] < 0.0
         if now - bounced_at <= READY or not (y >= plane or fallen):
-            return False
+            return
         answer = self.opponent.answer(Stroke(ball, velocity, world.ball_spin), landing[:2], now - self._hit_at)
         if answer is None:
             self._state = self._missed
-            return False
+            return
         world.strike(answer.velocity, answer.spin)
         self.played[-1].touches += 1
         self._state, self._struck_at = self._coming, now
-        return True
 
-    def _missed(self, world: World, now: float) -> bool:
+    def _missed(self, world: World, now: float) -> None:
         """The human has missed the ball, which flies on."""
-        bounces = sum(name == "col_table" and t > self._hit_at for t, name, _ in world.touches)
-        if not world.in_play or bounces > 1 or world.ball[2] < BELOW or now - self._hit_at > 2 * LONGEST:
-            return self._over(now)
-        return False
+        late = now - self._hit_at > 2 * LONGEST
+        if not world.in_play or len(self._bounces(world)) > 1 or world.ball[2] < BELOW or late:
+            self._over(now)
 
-    def _over(self, now: float) -> bool:
+    def _bounces(self, world: World) -> list[tuple[float, np.ndarray]]:
+        """Times [s] and places since the robot's hit."""
+        return [(time, place) for time, name, place in world.touches if name == "col_table" and time > self._hit_at]
+
+    def _over(self, now: float) -> None:
         self.opponent.rest()
         self.played[-1].ended = now
         self._state = self._waiting
         self._next_at = now + self._random.uniform(0.0, self.pause)
-        return False
 
 
 def ball_source(balls: Throws | Opponent, params: RigParams, first: int = 0) -> Thrower | Rallies:

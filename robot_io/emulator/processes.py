@@ -9,8 +9,11 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from functools import partial
 from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +21,9 @@ from robot_io.contract import PAPER, Contract
 from robot_io.control import realtime
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.devices.tracker import TrackerConfig
+from robot_io.devices.udp import UdpSocket
 from robot_io.emulator.arm import ArmController, ArmStateError
-from robot_io.emulator.axis_server import serve
+from robot_io.emulator.axis_server import AxisServer
 from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
@@ -34,8 +38,7 @@ PORT_RANGE = 20000, 32000
 PRIORITY = 40  # of SCHED_FIFO, where it is allowed
 
 
-@dataclass(frozen=True)
-class Ports:
+class Ports(NamedTuple):
     """Of the bridge's two sockets and the two drives."""
 
     arm: int
@@ -79,28 +82,24 @@ class Rig:
         params = for_robot(params, contract)
         self.params, self.ports, self._contract = params, ports or free_ports(len(contract.carrying)), contract
         self._shared = Shared(joints=contract.n_joints)
-        self._shared["silent_until"][0] = -1.0
         context = multiprocessing.get_context("spawn")
-        jobs: dict[str, tuple[Callable, tuple]] = {
-            "world": (_world, (scene, balls)),
-            "arm": (_arm, ()),
-            "axes": (_axes, ()),
-            "tracker": (_tracker, ()),
+        jobs: dict[str, Callable[[_Part], None]] = {
+            "world": partial(_world, scene=scene, balls=balls),
+            "arm": _arm,
+            "tracker": _tracker,
         }
-        if not contract.carrying:
-            del jobs["axes"]
+        if contract.carrying:
+            jobs["axes"] = _axes
+        else:
             self._shared["driven"][1] = np.inf  # nobody to wait for
         self._processes, self._pipes = {}, {}
-        for name, (job, arguments) in jobs.items():
-            mine, theirs = context.Pipe()
-            process = context.Process(
-                target=_run,
-                args=(job, self._shared.name, params, self.ports, contract, theirs, arguments),
-                name=f"rig-{name}",
-            )
+        for name, job in jobs.items():
+            self._pipes[name], theirs = context.Pipe()
+            given = self._shared.name, params, self.ports, contract, theirs
+            process = context.Process(target=_run, args=(job, *given), name=f"rig-{name}")
             process.start()
             theirs.close()
-            self._processes[name], self._pipes[name] = process, mine
+            self._processes[name] = process
         try:
             for name, pipe in self._pipes.items():
                 answer = pipe.recv() if pipe.poll(START_TIME) else "does not start"
@@ -124,18 +123,18 @@ class Rig:
 
     def switch_on(self) -> None:
         """Do what a person does at the arm's controller: motors on, RAPID, EGM."""
-        self._pipes["arm"].send(("switch_on",))
+        self._pipes["arm"].send("switch_on")
 
     def motors_off(self) -> None:
         """The emergency stop of the arm."""
-        self._pipes["arm"].send(("motors_off",))
+        self._pipes["arm"].send("motors_off")
 
     def press_stop(self) -> None:
         """The installation's emergency stop: takes the power from arm and axes, where it is wired to them."""
         if self.params.hidden.stop_wired:
             self.motors_off()
             for axis in range(len(self.ports.axes)):
-                self._to_axis("stop", axis)
+                self._to_axis("cut_power", axis)
 
     def hold(self, place: Vector | None) -> None:
         """A hand holds the ball at a place (3,) [m], or nowhere any more."""
@@ -147,24 +146,25 @@ class Rig:
 
     def drive_fault(self, axis: int, code: int) -> None:
         """A fault of one linear axis's drive. Raises DeviceError for a robot without such an axis."""
-        self._to_axis("fault", axis, code)
+        self._to_axis("inject_fault", axis, code)
 
     def connect_arm(self, connected: bool) -> None:
         """Pulls the network cable of the arm's controller or plugs it in again."""
-        self._pipes["arm"].send(("reconnect" if connected else "disconnect",))
+        self._pipes["arm"].send("reconnect" if connected else "disconnect")
 
     def connect_axis(self, axis: int, connected: bool) -> None:
         """Pulls a linear axis's network cable or plugs it in again. Raises DeviceError as ``drive_fault`` does."""
         self._to_axis("reconnect" if connected else "disconnect", axis)
 
     def _to_axis(self, request: str, axis: int, *details: int) -> None:
+        """Calls a method of an ``AxisEmulator``."""
         if not 0 <= axis < len(self.ports.axes):
             raise DeviceError(f"rig: {self._contract.robot} has {len(self.ports.axes)} linear axes, no number {axis}")
         self._pipes["axes"].send((request, axis, *details))
 
     def drop_out(self, seconds: float) -> None:
         """The tracker sends nothing for a while."""
-        self._pipes["tracker"].send(("drop_out", seconds))
+        self._pipes["tracker"].send(seconds)
 
     def jog(self) -> None:
         """Put the arm to its home pose, as somebody does with the controller's own pendant."""
@@ -212,14 +212,18 @@ class Rig:
         self.close()
 
 
+class _Part(NamedTuple):
+    """What a process of the rig works with."""
+
+    shared: Shared
+    params: RigParams
+    ports: Ports
+    contract: Contract
+    pipe: Connection
+
+
 def _run(
-    job: Callable,
-    name: str,
-    params: RigParams,
-    ports: Ports,
-    contract: Contract,
-    pipe: Connection,
-    arguments: tuple,
+    job: Callable[[_Part], None], name: str, params: RigParams, ports: Ports, contract: Contract, pipe: Connection
 ) -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # no terminal ends hardware; the owner's death does
         signal.signal(number, signal.SIG_IGN)
@@ -227,7 +231,7 @@ def _run(
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
     realtime.prepare(PRIORITY)
     try:
-        job(shared, params, ports, contract, pipe, *arguments)
+        job(_Part(shared, params, ports, contract, pipe))
     except (KeyboardInterrupt, BrokenPipeError, EOFError):
         pass
     except OSError as error:
@@ -239,7 +243,7 @@ def _run(
         shared.close()
 
 
-def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
+def _paced(shared: Shared, period: float) -> Iterator[float]:
     """Absolute deadlines [s] until the rig ends; missed ones are made up for one by one, as a real clock would."""
     parent = multiprocessing.parent_process()
     deadline, count = time.monotonic(), 0
@@ -256,25 +260,32 @@ def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
         yield deadline
 
 
-def _world(
-    shared: Shared,
-    params: RigParams,
-    ports: Ports,
-    contract: Contract,
-    pipe: Connection,
-    scene: str,
-    balls: Throws | Opponent,
-) -> None:
-    world = World(scene, params.world, contract)
+def _requests(pipe: Connection) -> Iterator[Any]:
+    while pipe.poll():
+        yield pipe.recv()
+
+
+def _world(part: _Part, scene: str, balls: Throws | Opponent) -> None:
+    shared, params = part.shared, part.params
+    world = World(scene, params.world, part.contract)
     source = ball_source(balls, params)
 
     def publish(now: float) -> None:
         number, seen = params.tracker.sees(world)
-        shared.publish(now, world.qpos, world.qvel, world.ball, number, seen, world.collisions, source.thrown)
+        shared.publish(
+            time=now,
+            qpos=world.qpos,
+            qvel=world.qvel,
+            ball=world.ball,
+            ball_number=number,
+            ball_in_play=seen,
+            collisions=world.collisions,
+            thrown=source.thrown,
+        )
 
     publish(time.monotonic())
-    pipe.send("ready")
-    for now in _paced(shared, pipe, WORLD_STEP):
+    part.pipe.send("ready")
+    for now in _paced(shared, WORLD_STEP):
         shared.await_drives(now)
         world.advance(shared["setpoint"].copy(), WORLD_STEP)
         if shared.value("jog"):
@@ -287,105 +298,73 @@ def _world(
         publish(now)
 
 
-def _arm(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
-    client = (HOST, ports.arm)
+def _arm(part: _Part) -> None:
+    shared, params, client = part.shared, part.params, (HOST, part.ports.arm)
     controller = ArmController(client, replace(params.arm, dead_time=params.arm.dead_time + params.action_delay))
     out, back = Network(params.arm_network, params.seed), Network(params.arm_network, params.seed + 1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-        wire.bind((HOST, 0))
-        wire.setblocking(False)
-        rows, connected, motion = list(contract.arm), True, Motion(shared)
-        pipe.send("ready")
-        for now in _paced(shared, pipe, params.arm.cycle):
-            while pipe.poll():
-                request = pipe.recv()[0]
-                if request in ("reconnect", "disconnect"):
-                    connected = request == "reconnect"
+    rows, connected, motion = list(part.contract.arm), True, Motion(shared)
+    with UdpSocket(HOST, 0, "rig") as wire:
+        part.pipe.send("ready")
+        for now in _paced(shared, params.arm.cycle):
+            for request in _requests(part.pipe):
+                if request == "motors_off":
+                    controller.motors_off()
+                elif request == "switch_on":
+                    with suppress(ArmStateError):  # it still brakes
+                        controller.switch_on()
                 else:
-                    _operate(controller, request)
+                    connected = request == "reconnect"
             shared["driven"][0] = now - params.arm.cycle  # the last set-point's time, also if this process was asleep
             qpos, qvel = motion.at(now)
-            hidden = params.hidden
-            setpoint, datagram = controller.step(now, hidden.counted(qpos[rows]), hidden.ordered(qvel[rows]))
-            shared["setpoint"][rows] = hidden.to_joints(setpoint)
+            shared["setpoint"][rows], datagram = params.hidden.drive_arm(controller, now, qpos[rows], qvel[rows])
             shared["driven"][0] = now
             if datagram is not None and connected:
                 out.send(datagram, now)
             for ready in out.due(now):
-                try:
-                    wire.sendto(ready, client)
-                except OSError:
-                    pass  # nobody listens
-            while True:
-                try:
-                    received = wire.recvfrom(2048)
-                except OSError:
-                    break
+                wire.send(ready, client)
+            for reply, source in wire.drain():
                 if connected:
-                    back.send(received[0], now)
-                if received[1] != client:
-                    controller.receive(received[0], received[1], now)  # counted as a stranger's
+                    back.send(reply, now)
+                if source != client:
+                    controller.receive(reply, source, now)  # counted as a stranger's
             for reply in back.due(now):
                 controller.receive(reply, client, now)
 
 
-def _operate(controller: ArmController, request: str) -> None:
-    if request == "motors_off":
-        controller.motors_off()
-        return
-    for action in (controller.motors_on, controller.start_rapid, controller.start_egm):
-        try:
-            action()
-        except ArmStateError:
-            pass  # it is so already
-
-
-def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
-    emulators = drives_of(params, contract)
-    servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
-    try:
+def _axes(part: _Part) -> None:
+    shared, carrying = part.shared, part.contract.carrying
+    emulators = drives_of(part.params, part.contract)
+    with ExitStack() as servers:
+        for emulator, port in zip(emulators, part.ports.axes, strict=True):
+            servers.enter_context(AxisServer(emulator, HOST, port))
         motion = Motion(shared)
-        pipe.send("ready")
-        for now in _paced(shared, pipe, AXIS_CYCLE):
-            while pipe.poll():
-                kind, axis, *rest = pipe.recv()
-                {
-                    "disconnect": emulators[axis].disconnect,
-                    "reconnect": emulators[axis].reconnect,
-                    "fault": emulators[axis].inject_fault,
-                    "stop": emulators[axis].cut_power,
-                }[kind](*rest)
+        part.pipe.send("ready")
+        for now in _paced(shared, AXIS_CYCLE):
+            for request, axis, *details in _requests(part.pipe):
+                getattr(emulators[axis], request)(*details)
             shared["driven"][1] = now - AXIS_CYCLE
             qpos, qvel = motion.at(now)
-            for k, (i, emulator) in enumerate(zip(contract.carrying, emulators, strict=True)):
-                shared["setpoint"][i] = params.hidden.drive(k, emulator, now, float(qpos[i]), float(qvel[i]))
+            for k, (i, emulator) in enumerate(zip(carrying, emulators, strict=True)):
+                place, speed = float(qpos[i]), float(qvel[i])
+                shared["setpoint"][i] = part.params.hidden.drive_axis(k, emulator, now, place, speed)
             shared["driven"][1] = now
-    finally:
-        for server in servers:
-            server.close()
 
 
-def _tracker(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
-    cameras, network = (
-        TrackerEmulator(params.tracker, params.seed + 2, params.hidden),
-        Network(params.tracker_network, params.seed + 3),
-    )
-    period = 1.0 / params.tracker.rate
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-        wire.bind((HOST, 0))
-        pipe.send("ready")
+def _tracker(part: _Part) -> None:
+    shared, params = part.shared, part.params
+    cameras = TrackerEmulator(params.tracker, params.seed + 2, params.hidden)
+    network = Network(params.tracker_network, params.seed + 3)
+    with UdpSocket(HOST, 0, "rig") as wire:
+        part.pipe.send("ready")
         # Several times a frame, so that frames leave close to the end of their latency.
-        for count, _ in enumerate(_paced(shared, pipe, period / 4)):
+        for count, _ in enumerate(_paced(shared, 1.0 / params.tracker.rate / 4)):
             now = time.monotonic()
-            while pipe.poll():
-                cameras.drop_out(now + pipe.recv()[1])
+            for seconds in _requests(part.pipe):
+                cameras.drop_out(now + seconds)
             if count % 4 == 0:
                 ball, in_play, number, taken = shared.read("ball", "ball_in_play", "ball_number", "time")
                 cameras.step(float(taken[0]), int(number[0]), ball if in_play[0] else None)
             for datagram in cameras.due(now):
                 network.send(datagram, now)
             for datagram in network.due(now):
-                try:
-                    wire.sendto(datagram, (HOST, ports.tracker))
-                except OSError:
-                    pass
+                wire.send(datagram, (HOST, part.ports.tracker))

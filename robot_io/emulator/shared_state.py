@@ -7,33 +7,22 @@ has read half of two states knows and reads again.
 from __future__ import annotations
 
 import math
+import sys
 import time as clock
 from multiprocessing import shared_memory
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robot_io.contract import N_JOINTS
 
-JOINTS = -1  # stands for as many numbers as the robot has joints
-_FIELDS = {
-    "version": 1,
-    "time": 1,
-    "qpos": JOINTS,
-    "qvel": JOINTS,
-    "ball": 3,
-    "ball_number": 1,
-    "ball_in_play": 1,
-    "collisions": 1,
-    "setpoint": JOINTS,
-    "throwing": 1,
-    "thrown": 1,
-    "finish": 1,
-    "estop": 1,
-    "jog": 1,
-    "held": 4,  # 1: the ball is at the place that follows; 2: it is clipped to the blade
-    "silent_until": 1,
-    "driven": 2,  # time [s] up to which arm and axes have given their set-points
-}
+JOINT_FIELDS = ("qpos", "qvel", "setpoint")
+# held: 1: the ball is at the place that follows, 2: it is clipped to the blade; driven: time [s] up to which arm and
+# axes have given their set-points.
+OTHER_FIELDS = {"ball": 3, "held": 4, "driven": 2} | dict.fromkeys(
+    ("version", "time", "ball_number", "ball_in_play", "collisions", "throwing", "thrown", "finish", "jog"), 1
+)
 
 START_TIME = 60.0  # [s] of a process of the rig, an opponent's compilations included
 AHEAD = 0.004  # [s] by which positions are told ahead of the world's newest state: two of its steps
@@ -44,57 +33,43 @@ PATIENCE = 0.6  # [s] of looks at a process that does nothing until it counts as
 
 
 class Shared:
-    """Views into the block by name; ``Shared()`` makes one for so many joints, ``Shared(name)`` attaches to it."""
+    """Fields of the block by name; ``Shared()`` makes one for so many joints, ``Shared(name)`` attaches to it."""
 
     def __init__(self, name: str | None = None, joints: int = N_JOINTS) -> None:
-        counts = {field: joints if count == JOINTS else count for field, count in _FIELDS.items()}
-        size = 8 * sum(counts.values())
+        counts = dict.fromkeys(JOINT_FIELDS, joints) | OTHER_FIELDS
+        kind = np.dtype([(field, np.float64, (count,)) for field, count in counts.items()])
+        # Python 3.13 can attach without its resource tracker, which otherwise unlinks the block when one process ends.
+        untracked: dict[str, Any] = {"track": False} if name is not None and sys.version_info >= (3, 13) else {}
         self._owner = name is None
         self._patience = Patience()
-        self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=size, **_untracked(name))
-        self._block = np.ndarray((sum(counts.values()),), np.float64, self._memory.buf)
+        self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=kind.itemsize, **untracked)
+        self._block = np.ndarray((), kind, self._memory.buf)
         if self._owner:
-            self._block[:] = 0.0
-        start = 0
-        self.views: dict[str, np.ndarray] = {}
-        for field, count in counts.items():
-            self.views[field] = self._block[start : start + count]
-            start += count
+            for field in counts:
+                self[field][:] = 0.0
 
     @property
     def name(self) -> str:
         return self._memory.name
 
     def __getitem__(self, field: str) -> np.ndarray:
-        return self.views[field]
+        return self._block[field]
 
     def value(self, field: str) -> float:
-        return float(self.views[field][0])
+        return float(self[field][0])
 
-    def publish(
-        self,
-        time: float,
-        qpos: np.ndarray,
-        qvel: np.ndarray,
-        ball: np.ndarray,
-        number: int,
-        in_play: bool,
-        collisions: int,
-        thrown: int,
-    ) -> None:
-        """The world's state at ``time`` [s]."""
-        views = self.views
-        views["version"][0] += 1
-        views["time"][0], views["qpos"][:], views["qvel"][:], views["ball"][:] = time, qpos, qvel, ball
-        views["ball_number"][0], views["ball_in_play"][0] = number, in_play
-        views["collisions"][0], views["thrown"][0] = collisions, thrown
-        views["version"][0] += 1
+    def publish(self, **state: ArrayLike) -> None:
+        """Write fields of one state of the world."""
+        self["version"][0] += 1
+        for field, value in state.items():
+            self[field][:] = value
+        self["version"][0] += 1
 
     def read(self, *fields: str) -> list[np.ndarray]:
         """Copies of fields that belong to one state."""
         while True:
             before = self.value("version")
-            copies = [self.views[field].copy() for field in fields]
+            copies = [self[field].copy() for field in fields]
             if before % 2 == 0 and self.value("version") == before:
                 return copies
 
@@ -110,7 +85,6 @@ class Shared:
             clock.sleep(LOOK)
 
     def close(self) -> None:
-        self.views.clear()
         del self._block
         self._memory.close()
         self.unlink()
@@ -176,10 +150,3 @@ class Motion:
     def _look(self) -> tuple[float, np.ndarray, np.ndarray]:
         taken, qpos, qvel = self._shared.read("time", "qpos", "qvel")
         return float(taken[0]), qpos, qvel
-
-
-def _untracked(name: str | None) -> dict:
-    """Python 3.13 can attach without its resource tracker, which otherwise unlinks the block when one process ends."""
-    import sys
-
-    return {"track": False} if name is not None and sys.version_info >= (3, 13) else {}

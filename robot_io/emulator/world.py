@@ -47,6 +47,7 @@ FINE = 4  # steps instead of one near a surface
 NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
 
 Vector = Sequence[float] | np.ndarray  # (3,)
+ZERO = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,28 +87,28 @@ class World:
         free = self.model.joint("ball_free")
         self._ball_q, self._ball_v = int(free.qposadr[0]), int(free.dofadr[0])
         self._ball_body = self.model.body("ball").id
+        # Views of the ball's state; the spin is in its body's frame, which the rotation turns into the table's.
+        self._position, self._velocity = self.data.qpos[self._ball_q :][:3], self.data.qvel[self._ball_v :][:3]
+        self._body_spin = self.data.qvel[self._ball_v + 3 :][:3]
+        self._rotation = self.data.xmat[self._ball_body].reshape(3, 3)
         self._ball_geom, self._paddle_geom = self.model.geom("ball").id, self.model.geom("rig_paddle").id
         self._site = self.model.site("paddle").id
         self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in contract.joints]].copy()
-        self.in_play = False
-        self.number = self.strokes = 0  # of the ball in play, of the human
-        self._touching: set[int] = set()  # geoms
-        self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
         self._surfaces = {
             self.model.geom("col_table").id: (self.params.table_restitution, self.params.table_friction),
             self.model.geom("net").id: NET,
         }
-        self.held: np.ndarray | None = None  # [m] where a hand holds the ball
-        self.on_blade = False  # the ball is clipped to the blade
-        self.collisions = 0  # steps in which robot and table touched
         self.reset()
 
     def reset(self) -> None:
         """Robot at home and at rest, ball away, time zero."""
         mujoco.mj_resetData(self.model, self.data)
-        self.number = self.strokes = 0
-        self.collisions, self.touches, self._touching = 0, [], set()
-        self.held, self.on_blade = None, False
+        self.number = self.strokes = 0  # of the ball in play, of the human
+        self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
+        self._touching: set[int] = set()  # geoms
+        self.collisions = 0  # steps in which robot and table touched
+        self.held: np.ndarray | None = None  # [m] where a hand holds the ball
+        self.on_blade = False  # the ball is clipped to the blade
         self.data.qpos[self._q] = self.home
         self.park()
         mujoco.mj_forward(self.model, self.data)
@@ -128,17 +129,16 @@ class World:
     @property
     def ball(self) -> np.ndarray:
         """Position (3,) [m] of the ball, wherever it is."""
-        return self.data.qpos[self._ball_q : self._ball_q + 3].copy()
+        return self._position.copy()
 
     @property
     def ball_velocity(self) -> np.ndarray:
-        return self.data.qvel[self._ball_v : self._ball_v + 3].copy()
+        return self._velocity.copy()
 
     @property
     def ball_spin(self) -> np.ndarray:
         """Angular velocity (3,) [rad/s] in the table frame."""
-        v = self._ball_v
-        return self.data.xmat[self._ball_body].reshape(3, 3) @ self.data.qvel[v + 3 : v + 6]
+        return self._rotation @ self._body_spin
 
     @property
     def answered(self) -> bool:
@@ -146,17 +146,18 @@ class World:
         hit = next((t for t, name, _ in self.touches if name == "rig_paddle"), None)
         return hit is None or not any(name == "col_table" and t > hit and p[1] > 0.0 for t, name, p in self.touches)
 
-    def throw(self, position: Vector, velocity: Vector, spin: Vector = (0.0, 0.0, 0.0)) -> None:
+    def throw(self, position: Vector, velocity: Vector, spin: Vector = ZERO) -> None:
         """Puts a new ball into play."""
-        self._place(position, velocity, spin)
-        mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
-        self.in_play, self._touching, self.touches = True, set(), []
-        self.number, self.strokes = self.number + 1, self.strokes + 1
+        self.number, self.in_play = self.number + 1, True
+        self._start(position, velocity, spin)
 
     def strike(self, velocity: Vector, spin: Vector) -> None:
         """Gives the ball in play another velocity and spin, where it is."""
-        self._place(self.ball, velocity, spin)
-        mujoco.mj_kinematics(self.model, self.data)
+        self._start(self.ball, velocity, spin)
+
+    def _start(self, position: Vector, velocity: Vector, spin: Vector) -> None:
+        self._place(position, velocity, spin)
+        mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
         self._touching, self.touches = set(), []
         self.strokes += 1
 
@@ -177,23 +178,21 @@ class World:
         whole: the linear axes as well, which are pushed by hand, without power.
         """
         joints = slice(None) if whole else self._arm
-        self.data.qpos[self._q[joints]], self.data.qvel[self._v[joints]] = self.home[joints], 0.0
-        mujoco.mj_forward(self.model, self.data)
+        self.hold(joints, self.home[joints])
 
-    def hold(self, joint: int, place: float) -> None:
-        """Puts a joint to a place, at rest: an obstacle is there."""
-        self.data.qpos[self._q[joint]], self.data.qvel[self._v[joint]] = place, 0.0
+    def hold(self, joints: int | slice | list[int], place: float | np.ndarray) -> None:
+        """Puts joints to a place, at rest: an obstacle is there."""
+        self.data.qpos[self._q[joints]], self.data.qvel[self._v[joints]] = place, 0.0
         mujoco.mj_forward(self.model, self.data)
 
     def park(self) -> None:
         """Takes the ball out of play."""
-        self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._place(PARKED, ZERO, ZERO)
         self.in_play = False
 
     def _place(self, position: Vector, velocity: Vector, spin: Vector) -> None:
-        q, v = self._ball_q, self._ball_v
-        self.data.qpos[q : q + 7] = [*position, 1.0, 0.0, 0.0, 0.0]
-        self.data.qvel[v : v + 6] = [*velocity, *spin]
+        self.data.qpos[self._ball_q :][:7] = [*position, 1.0, 0.0, 0.0, 0.0]
+        self.data.qvel[self._ball_v :][:6] = [*velocity, *spin]
         self.data.xfrc_applied[self._ball_body] = 0.0
 
     def advance(self, setpoint: np.ndarray, duration: float) -> None:
@@ -207,43 +206,35 @@ class World:
         if self.visible and not self.in_play:
             self._integrate(1, duration)
             place = self.clipped if self.on_blade else self.held
-            self._place(PARKED if place is None else place, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self._place(PARKED if place is None else place, ZERO, ZERO)
             return
         if not self.in_play:
-            self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self._place(PARKED, ZERO, ZERO)
             self._integrate(1, duration)
             return
         steps = FINE if self._near_surface() else 1
         self._integrate(steps, duration / steps)
-        if self.data.qpos[self._ball_q + 2] < FLOOR or abs(self.data.qpos[self._ball_q + 1]) > 5.0 or self._resting():
+        _, y, z = self._position
+        resting = z < 2.0 * BALL_RADIUS and self._velocity @ self._velocity < RESTING**2  # nobody plays it any more
+        if z < FLOOR or abs(y) > 5.0 or resting:
             self.park()
 
-    def _resting(self) -> bool:
-        """True for a ball that lies on the table: nobody plays it any more."""
-        height, velocity = self.data.qpos[self._ball_q + 2], self.data.qvel[self._ball_v : self._ball_v + 3]
-        return bool(height < 2.0 * BALL_RADIUS and velocity @ velocity < RESTING**2)
-
     def _near_surface(self) -> bool:
-        x, y, z = self.data.qpos[self._ball_q : self._ball_q + 3]
-        if z < NEAR and abs(x) < 0.8 and abs(y) < 1.45:
-            return True
-        if abs(y) < NEAR and z < 0.25:
-            return True
-        arm = self.data.qpos[self._ball_q : self._ball_q + 3] - self.data.site_xpos[self._site]
-        return bool(arm @ arm < (PADDLE_RADIUS + NEAR) ** 2)
+        x, y, z = self._position
+        over_table, at_net = z < NEAR and abs(x) < 0.8 and abs(y) < 1.45, abs(y) < NEAR and z < 0.25
+        arm = self._position - self.data.site_xpos[self._site]
+        return bool(over_table or at_net or arm @ arm < (PADDLE_RADIUS + NEAR) ** 2)
 
     def _integrate(self, steps: int, timestep: float) -> None:
-        data, v = self.data, self._ball_v
+        data, velocity = self.data, self._velocity
         self.model.opt.timestep = timestep
         for _ in range(steps):
             if self.in_play:
-                velocity = data.qvel[v : v + 3]
                 acceleration = -self.params.drag * np.sqrt(velocity @ velocity) * velocity
-                if self.params.magnus:  # a free joint's angular velocity is in the body's frame
-                    spin = data.xmat[self._ball_body].reshape(3, 3) @ data.qvel[v + 3 : v + 6]
-                    acceleration += self.params.magnus * np.cross(spin, velocity)
+                if self.params.magnus:
+                    acceleration += self.params.magnus * np.cross(self.ball_spin, velocity)
                 data.xfrc_applied[self._ball_body, :3] = BALL_MASS * acceleration
-            before = data.qvel[v : v + 3].copy()
+            before = velocity.copy()
             mujoco.mj_step(self.model, data)
             if data.ncon or self._touching:
                 self._contacts(before)
@@ -268,17 +259,15 @@ class World:
 
         alpha: by Coulomb on table and net, the rubber's gain on the paddle.
         """
-        data, q, v = self.data, self._ball_q, self._ball_v
-        position = data.qpos[q : q + 3]
-        if normal @ (position - place) < 0:
+        data = self.data
+        if normal @ (self._position - place) < 0:
             normal = -normal
         blade = np.zeros(3)
         if surface == self._paddle_geom:
             motion = np.zeros(6)  # angular, linear
             mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_SITE, self._site, motion, 0)
             blade = motion[3:] + np.cross(motion[:3], place - data.site_xpos[self._site])
-        rotation = data.xmat[self._ball_body].reshape(3, 3)
-        spin = rotation @ data.qvel[v + 3 : v + 6]
+        spin = self.ball_spin
         slip = before + np.cross(spin, -BALL_RADIUS * normal) - blade
         normal_speed = slip @ normal
         slip -= normal * normal_speed
@@ -288,9 +277,9 @@ class World:
             limit = friction * (1.0 + restitution) * abs(normal_speed) / max(np.sqrt(slip @ slip), 1e-9)
             alpha = min(limit, STICKING)
         change = -alpha * slip
-        data.qvel[v : v + 3] += change
+        self._velocity += change
         spin = spin - BALL_MASS * BALL_RADIUS / SHELL_INERTIA * np.cross(normal, change)
-        data.qvel[v + 3 : v + 6] = rotation.T @ spin
+        self._body_spin[:] = self._rotation.T @ spin
 
 
 def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjModel:
@@ -323,11 +312,7 @@ def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjM
         mass=0.0,
         group=3,
     )
-    restitutions = {
-        "col_table": params.table_restitution,
-        "net": NET[0],
-        "rig_paddle": params.paddle_restitution,
-    }
+    restitutions = {"col_table": params.table_restitution, "net": NET[0], "rig_paddle": params.paddle_restitution}
     for name, restitution in restitutions.items():
         damping = damping_for(restitution, STIFFNESS, params.timestep / FINE)
         spec.add_pair(geomname1="ball", geomname2=name, condim=1, solref=[-STIFFNESS, -damping], solimp=SOLIMP)

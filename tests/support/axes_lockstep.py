@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, DirectLink, FestoAxes, FhppProfile
+from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile
 from robot_io.emulator.axes import AxisEmulator
 
 STEP, CYCLE = 0.001, 0.008  # [s]
@@ -19,12 +19,12 @@ LOWER, UPPER = (-1.0, -0.5), (1.0, 0.5)
 class LockStep:
     """position, velocity (2,): of the plants; ``each`` is called before every cycle with the time."""
 
-    def __init__(self, profile="cmmt", start=(0.2, -0.1), config=None, wrap=DirectLink, **emulator):
-        kind, codec = PROFILES[profile]
-        self.emulators = [AxisEmulator(kind, **{"node_guard": 0.1, **emulator}) for _ in range(2)]
+    def __init__(self, profile="cmmt", start=(0.2, -0.1), config=None, kind=AxisEmulator, **emulator):
+        name, codec = PROFILES[profile]
+        self.emulators = [kind(name, **{"node_guard": 0.1, **emulator}) for _ in range(2)]
         self.axes = FestoAxes(
             [
-                Axis(name, wrap(emulator), codec, lower, upper)
+                Axis(name, emulator, codec, lower, upper)
                 for name, emulator, lower, upper in zip(("x", "y"), self.emulators, LOWER, UPPER, strict=True)
             ],
             config or AxesConfig(),

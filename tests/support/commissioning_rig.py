@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from contextlib import suppress
 
 import numpy as np
 
@@ -83,11 +84,8 @@ class LockStepHands:
         self._rig.throwing = on
 
     def switch_on(self):
-        for action in (self._rig.arm.motors_on, self._rig.arm.start_rapid, self._rig.arm.start_egm):
-            try:
-                action()
-            except ArmStateError:
-                pass
+        with suppress(ArmStateError):  # it still brakes
+            self._rig.arm.switch_on()
 
     def press_stop(self):
         if self._rig.params.hidden.stop_wired:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from robot_io.contract import ABB_JOINTS
-from robot_io.emulator.tracker.hidden import HiddenErrors
+from robot_io.emulator.hidden import HiddenErrors
 from tests.support.lockstep_play import world
 
 HIDDEN = HiddenErrors(

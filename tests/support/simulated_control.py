@@ -60,8 +60,7 @@ class Simulated:
         self.pipe, theirs = multiprocessing.Pipe()
         sockets = {"arm": ArmSocket(self.simulation), "tracker": FrameSocket(self.simulation)}
         monkeypatch.setattr(process, "UdpSocket", lambda host, port, key: sockets[key])
-        monkeypatch.setattr(process, "linear_axes", lambda *_: None)
-        monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
+        monkeypatch.setattr(process, "linear_axes", lambda *_: self.simulation.axes)
         monkeypatch.setattr(process, "EgmConfig", partial(EgmConfig, ramp_in=0.0))  # as the simulation's arm
         monkeypatch.setattr(realtime, "prepare", lambda *_: [])
         clock = SimpleNamespace(monotonic=lambda: self.simulation.now, sleep=self._sleep)

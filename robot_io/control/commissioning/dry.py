@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.devices.egm.session import ArmFeedback, EgmConfig, EgmSession
+from robot_io.devices.egm.messages import ArmFeedback
+from robot_io.devices.egm.session import EgmConfig, EgmSession
 
 HEARD = 0.2  # [s] since a packet of the real arm
 
@@ -64,10 +65,6 @@ class DryAxes:
 
     @property
     def state(self) -> DryAxes:
-        return self
-
-    @property
-    def axes(self) -> DryAxes:
         return self
 
     def cycle(self, now: float) -> None:

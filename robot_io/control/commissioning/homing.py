@@ -136,12 +136,12 @@ def prepare(axes: AxesThread | DryAxes | FixedBase, check: Callable[[], None]) -
 
     Until it is, nothing is homed: what is asked for here passes the gate by.
     """
-    if axes.axes.fault:
+    if axes.fault:
         axes.acknowledge()
     axes.enable()
-    if not axes.axes.answering:  # whether they must be homed is not known: a cable was out
+    if not axes.answering:  # whether they must be homed is not known: a cable was out
         raise RefusedError("axes not ready: one of them does not answer yet; try again")
-    if not axes.axes.homed:
+    if not axes.homed:
         check()
         axes.home()
 

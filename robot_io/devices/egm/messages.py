@@ -10,6 +10,7 @@ reads. What it cannot accept raises ``EgmError`` and nothing else.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,23 +121,25 @@ class EgmError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class RobotMessage:
+class ArmFeedback:
     """State that the controller reports (EgmRobot).
 
     sequence         header.seqno, modulo 2**32
-    time_ms          header.tm, the controller's clock [ms], modulo 2**32
+    time             header.tm, the controller's clock [s]; starts again at 0 every 49.7 days
     position         (6,) measured joint positions [rad], read-only
     motors_on        MOTORS_ON; undefined counts as off
     egm_running      MCI_RUNNING
     rapid_running    RAPID_RUNNING, or RAPID_UNDEFINED: some controllers report that after a restart while RAPID runs
+    received         [s] on the receiver's clock, when a session has accepted it
     """
 
     sequence: int
-    time_ms: int
+    time: float
     position: np.ndarray
     motors_on: bool
     egm_running: bool
     rapid_running: bool
+    received: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,16 +151,13 @@ class SensorMessage:
     velocity: np.ndarray
 
 
-def decode_robot(datagram: bytes, joints: int = N_ARM_JOINTS) -> RobotMessage:
+def decode_robot(datagram: bytes, joints: int = N_ARM_JOINTS) -> ArmFeedback:
     """Reads an EgmRobot of an arm. Raises EgmError where it is not one, or not a complete one."""
-    message = _parse(EgmRobot, datagram)
-    _require(message, "header", "feedBack", "motorState", "mciState", "rapidExecState")
-    _require(message.header, "seqno", "tm", "mtype")
-    _require_type(message.header, _HEADER.MSGTYPE_DATA)
-    _require(message.feedBack, "joints")
-    return RobotMessage(
+    needed = "header.tm", "feedBack.joints", "motorState", "mciState", "rapidExecState"
+    message = _parse(EgmRobot, datagram, _HEADER.MSGTYPE_DATA, *needed)
+    return ArmFeedback(
         sequence=message.header.seqno,
-        time_ms=message.header.tm,
+        time=message.header.tm / 1000.0,
         position=_radians(message.feedBack, "EgmRobot.feedBack", joints),
         motors_on=message.motorState.state == _MOTORS.MOTORS_ON,
         egm_running=message.mciState.state == _MCI.MCI_RUNNING,
@@ -189,12 +189,8 @@ def encode_robot(
 
 def decode_sensor(datagram: bytes, joints: int = N_ARM_JOINTS) -> SensorMessage:
     """Reads an EgmSensor that has joint positions and joint speeds. Raises EgmError where it has not."""
-    message = _parse(EgmSensor, datagram)
-    _require(message, "header", "planned", "speedRef")
-    _require(message.header, "seqno", "mtype")  # tm is left out by several clients
-    _require_type(message.header, _HEADER.MSGTYPE_CORRECTION)
-    _require(message.planned, "joints")
-    _require(message.speedRef, "joints")
+    # header.tm is left out by several clients
+    message = _parse(EgmSensor, datagram, _HEADER.MSGTYPE_CORRECTION, "planned.joints", "speedRef.joints")
     return SensorMessage(
         sequence=message.header.seqno,
         position=_radians(message.planned, "EgmSensor.planned", joints),
@@ -212,7 +208,8 @@ def encode_sensor(sequence: int, time_ms: int, position: ArrayLike, velocity: Ar
     return message.SerializeToString()
 
 
-def _parse(kind: type[Message], datagram: bytes) -> Message:
+def _parse(kind: type[Message], datagram: bytes, message_type: int, *needed: str) -> Message:
+    """The message, whose header has this type, with all fields of these dotted names."""
     name = kind.DESCRIPTOR.name
     if len(datagram) > MAX_DATAGRAM:
         raise EgmError("oversized", f"a datagram of more than {MAX_DATAGRAM} bytes is no {name}")
@@ -224,31 +221,28 @@ def _parse(kind: type[Message], datagram: bytes) -> Message:
     if not message.IsInitialized():
         missing = ", ".join(message.FindInitializationErrors())
         raise EgmError("incomplete", f"{name} without its required {missing}")
+    needed = "header.seqno", "header.mtype", *needed
+    for path in needed:
+        part = message
+        for field in path.split("."):
+            if not part.HasField(field):
+                raise EgmError("incomplete", f"{name} without {path}; it needs {', '.join(needed)}")
+            part = getattr(part, field)
+    if message.header.mtype != message_type:
+        found, wanted = map(_HEADER.MessageType.Name, (message.header.mtype, message_type))
+        raise EgmError("wrong_type", f"message type {found}, expected {wanted}")
     return message
-
-
-def _require(message: Message, *names: str) -> None:
-    for name in names:
-        if not message.HasField(name):
-            raise EgmError("incomplete", f"{message.DESCRIPTOR.name} without {name}; it needs {', '.join(names)}")
-
-
-def _require_type(header: Message, wanted: int) -> None:
-    if header.mtype != wanted:
-        name = _HEADER.MessageType.Name
-        raise EgmError("wrong_type", f"message type {name(header.mtype)}, expected {name(wanted)}")
 
 
 def _radians(holder: Message, name: str, joints: int) -> np.ndarray:
     degrees, own = list(holder.joints.joints), min(joints, N_ARM_JOINTS)
     if len(degrees) != own:
         raise EgmError("joint_count", f"{name}.joints has {len(degrees)} numbers, the arm has {own} joints")
-    if joints > own:
-        degrees += holder.externalJoints.joints[: joints - own]
-        if len(degrees) != joints:
-            count = len(degrees) - own
-            wanted = f"{name}.externalJoints has {count} numbers, joints 7 to {joints} of the arm are wanted there"
-            raise EgmError("joint_count", wanted)
+    degrees += holder.externalJoints.joints[: joints - own]
+    if len(degrees) != joints:
+        count = len(degrees) - own
+        wanted = f"{name}.externalJoints has {count} numbers, joints 7 to {joints} of the arm are wanted there"
+        raise EgmError("joint_count", wanted)
     radians = np.deg2rad(degrees)
     if not np.isfinite(radians).all():
         raise EgmError("not_finite", f"{name} has a non-finite number: {list(degrees)}")
@@ -258,13 +252,6 @@ def _radians(holder: Message, name: str, joints: int) -> np.ndarray:
 
 def _fill(holder: Message, radians: ArrayLike, name: str) -> None:
     """Write the joints [rad], the first six as such and others as external ones."""
-    degrees = _degrees(radians, name)
-    holder.joints.joints.extend(degrees[:N_ARM_JOINTS])
-    if len(degrees) > N_ARM_JOINTS:
-        holder.externalJoints.joints.extend(degrees[N_ARM_JOINTS:])
-
-
-def _degrees(radians: ArrayLike, name: str) -> list[float]:
     values = np.asarray(radians, np.float64)
     if values.ndim != 1 or not N_ARM_JOINTS <= values.size <= 2 * N_ARM_JOINTS:
         raise ValueError(f"{name} has shape {values.shape}, the arm needs ({N_ARM_JOINTS},)")
@@ -272,4 +259,6 @@ def _degrees(radians: ArrayLike, name: str) -> list[float]:
         degrees = np.rad2deg(values)
     if not np.isfinite(degrees).all():
         raise ValueError(f"{name} has a non-finite number: {values.tolist()}; nothing is sent")
-    return degrees.tolist()
+    holder.joints.joints.extend(degrees[:N_ARM_JOINTS].tolist())
+    if len(degrees) > N_ARM_JOINTS:
+        holder.externalJoints.joints.extend(degrees[N_ARM_JOINTS:].tolist())

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import ipaddress
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from robot_io.contract import ABB_JOINTS
-from robot_io.devices.egm.messages import UINT32, decode_robot, encode_sensor
-from robot_io.devices.egm.messages import EgmError as EgmError
+from robot_io.devices.egm.messages import UINT32, ArmFeedback, EgmError, decode_robot, encode_sensor
 
 DEFAULT_PORT = 6510
 RECENT = 1.0  # [s] of controller time: a packet that much older or newer than the last is no neighbour of it
@@ -60,26 +59,6 @@ class EgmConfig:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class ArmFeedback:
-    """The newest accepted packet of the controller.
-
-    sequence         of the packet, modulo 2**32
-    time             controller's clock [s]; starts again at 0 every 49.7 days
-    position         (6,) measured joint positions [rad], read-only
-    motors_on, egm_running, rapid_running
-    received         ``now`` at its reception [s]
-    """
-
-    sequence: int
-    time: float
-    position: np.ndarray
-    motors_on: bool
-    egm_running: bool
-    rapid_running: bool
-    received: float
-
-
 @dataclass
 class EgmStatistics:
     """Counters since the session object was made.
@@ -114,7 +93,6 @@ class EgmSession:
         self.statistics = EgmStatistics()
         self._zeros = np.array(config.zeros)
         self._began = -np.inf  # [s] of the newest session
-        self._time_ms = 0
         self._pending = False
         self._reply_sequence = 0
         self._last_refusal = ""
@@ -125,8 +103,7 @@ class EgmSession:
         self.statistics.received += 1
         if not self._trusts(source, now):
             self._note_rival(datagram, source, now)
-            address = self.config.controller_address or (self.endpoint[0] if self.endpoint else "no address")
-            port = self.config.controller_port or (self.endpoint[1] if self.endpoint else None)
+            address, port = self._trusted
             trusted = address if port is None or source[0] != address else f"{address} port {port}"
             return self._refuse("stranger", f"from {source[0]} port {source[1]}, only {trusted} is trusted")
         try:
@@ -135,7 +112,7 @@ class EgmSession:
             return self._refuse(error.reason, str(error))
         last, new_session = self.feedback, True
         if last is not None:
-            steps, elapsed_ms = message.sequence - last.sequence, message.time_ms - self._time_ms
+            steps, elapsed_ms = message.sequence - last.sequence, round(1000.0 * (message.time - last.time))
             order = _order(steps, elapsed_ms, now - last.received, self.config)
             if order in ("duplicate", "out_of_order"):
                 return self._refuse(order, f"sequence {message.sequence} after {last.sequence}")
@@ -146,16 +123,9 @@ class EgmSession:
         self.session_id += new_session
         self._began = now if new_session else self._began
         self.endpoint = (source[0], source[1])
-        self._time_ms = message.time_ms
-        self.feedback = ArmFeedback(
-            sequence=message.sequence,
-            time=message.time_ms / 1000.0,
-            position=_read_only(message.position + self._zeros),
-            motors_on=message.motors_on,
-            egm_running=message.egm_running,
-            rapid_running=message.rapid_running,
-            received=now,
-        )
+        position = message.position + self._zeros
+        position.flags.writeable = False
+        self.feedback = replace(message, position=position, received=now)
         self._pending = True
         self.statistics.accepted += 1
         return True
@@ -221,13 +191,16 @@ class EgmSession:
             return
         self._rival = (source[1], now)
 
+    @property
+    def _trusted(self) -> tuple[str | None, int | None]:
+        """Address and port of the controller as configured, else as learned; None: any."""
+        address, port = self.endpoint or (None, None)
+        return self.config.controller_address or address, self.config.controller_port or port
+
     def _trusts(self, source: tuple[str, int], now: float) -> bool:
-        address = self.config.controller_address or (self.endpoint and self.endpoint[0])
-        if address and source[0] != address:
-            return False
-        if self.config.controller_port is not None:
-            return source[1] == self.config.controller_port
-        return self.endpoint is None or source[1] == self.endpoint[1] or self._is_stale(now)
+        address, port = self._trusted
+        learns = self.config.controller_port is None and self._is_stale(now)
+        return address in (None, source[0]) and (learns or port in (None, source[1]))
 
     def _is_stale(self, now: float) -> bool:
         return self.feedback is None or now - self.feedback.received > self.config.timeout
@@ -261,11 +234,6 @@ def _order(sequence_change: int, time_change: int, silence: float, config: EgmCo
         return "out_of_order"
     neighbour = 0 < steps < RECENT / config.period and 0 <= elapsed < RECENT
     return "next" if neighbour and silence <= config.timeout else "new"
-
-
-def _read_only(values: np.ndarray) -> np.ndarray:
-    values.flags.writeable = False
-    return values
 
 
 def _signed(difference: int) -> int:

@@ -15,17 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 
-from robot_io.devices.festo.faults import CMMT_FAULTS, fault_text
 from robot_io.devices.festo.modbus_link import RegisterLink
-from robot_io.devices.festo.profile import (
-    INT32,
-    AxisCommand,
-    AxisStatus,
-    SetUpError,
-    count_of,
-    expect_count,
-    signed,
-)
+from robot_io.devices.festo.profile import INT32, AxisCommand, AxisProfile, AxisStatus, SetUpError, count_of
 
 OUTPUT_ADDRESS, INPUT_ADDRESS, BLOCK = 0, 100, 28
 TIMEOUT_ADDRESS = 400  # 32 bits, low word first [ms]
@@ -47,63 +38,51 @@ N2, N4 = 0x4000, 0x40000000  # 100 %
 ALL_N2 = (0, 0x7FFF)
 
 
-class STW1(IntFlag):
-    """Control word 1, position mode."""
-
-    ON = 1 << 0
-    NO_COAST_STOP = 1 << 1
-    NO_QUICK_STOP = 1 << 2
-    ENABLE_OPERATION = 1 << 3
-    NO_REJECT_TASK = 1 << 4  # 0: brake and drop the traversing task
-    NO_INTERMEDIATE_STOP = 1 << 5
-    ACTIVATE_TASK = 1 << 6
-    FAULT_ACKNOWLEDGE = 1 << 7
-    CONTROL_BY_PLC = 1 << 10
-    START_HOMING = 1 << 11
-
-
-class PosSTW1(IntFlag):
-    """Positioning control word 1."""
-
-    ABSOLUTE = 1 << 8
-    CONTINUOUS_UPDATE = 1 << 12  # new MDI values count at once, without a new edge of ACTIVATE_TASK
-    MDI = 1 << 15
-
-
-class PosSTW2(IntFlag):
-    """Positioning control word 2."""
-
-    SOFTWARE_LIMITS = 1 << 14
-    HARDWARE_LIMITS = 1 << 15
-
-
-class ZSW1(IntFlag):
-    """Status word 1, position mode."""
-
-    READY_TO_SWITCH_ON = 1 << 0
-    READY_TO_OPERATE = 1 << 1
-    OPERATION_ENABLED = 1 << 2
-    FAULT = 1 << 3
-    NO_COAST_STOP = 1 << 4
-    NO_QUICK_STOP = 1 << 5
-    INHIBITED = 1 << 6
-    WARNING = 1 << 7
-    FOLLOWING = 1 << 8  # following error within its tolerance
-    CONTROL_REQUESTED = 1 << 9
-    TARGET_REACHED = 1 << 10
-    HOME_SET = 1 << 11
-    TASK_ACKNOWLEDGED = 1 << 12
-    STOPPED = 1 << 13
-    ACCELERATES = 1 << 14
-    DECELERATES = 1 << 15
+# Diagnostic numbers as in festo-edcon's ``icp_map.csv``.
+CMMT_FAULTS = {
+    10: "short circuit in the motor's phases or the braking resistor: check the wiring",
+    11: "overcurrent: check the motor's phases and the braking resistor for a short circuit",
+    13: "motor overloaded (I2t): is the axis blocked or stiff?",
+    15: "output stage overloaded (I2t): is the axis blocked or stiff?",
+    20: "braking resistor overloaded: brake less hard or fit a larger one",
+    30: "overvoltage in the DC link: check the braking resistor",
+    31: "undervoltage in the DC link: check the power supply",
+    36: "no load voltage: release the emergency stop and check the power supply",
+    37: "load voltage was interrupted: check the power supply",
+    47: "drive too hot",
+    51: "power unit too hot",
+    55: "motor too hot",
+    57: "homing took too long",
+    58: "homing found no reference on its way",
+    109: "negative software limit reached",
+    110: "positive software limit reached",
+    114: "negative limit switch reached",
+    115: "positive limit switch reached",
+    126: "following error of the position: is the axis blocked or asked for too much?",
+    127: "following error of the velocity: is the axis blocked or asked for too much?",
+    148: "the two STO inputs disagreed: check the emergency stop's wiring",
+    282: "encoder not ready",
+    391: "process data stayed away (node guard): was the computer or the network stopped?",
+    394: "process data invalid: does the drive's set-up select telegram 111?",
+}
 
 
-class PosZSW1(IntFlag):
-    """Positioning status word 1."""
-
-    HOMING = 1 << 11
-    MDI = 1 << 15
-
+# Bits in their order from 0 on.
+STW1 = IntFlag(  # control word 1 in position mode; without NO_REJECT_TASK the drive brakes and drops its task
+    "STW1",
+    "ON NO_COAST_STOP NO_QUICK_STOP ENABLE_OPERATION NO_REJECT_TASK NO_INTERMEDIATE_STOP ACTIVATE_TASK "
+    "FAULT_ACKNOWLEDGE JOG_1 JOG_2 CONTROL_BY_PLC START_HOMING",
+)
+ZSW1 = IntFlag(  # status word 1 in position mode; FOLLOWING: the following error is within its tolerance
+    "ZSW1",
+    "READY_TO_SWITCH_ON READY_TO_OPERATE OPERATION_ENABLED FAULT NO_COAST_STOP NO_QUICK_STOP INHIBITED WARNING "
+    "FOLLOWING CONTROL_REQUESTED TARGET_REACHED HOME_SET TASK_ACKNOWLEDGED STOPPED ACCELERATES DECELERATES",
+)
+# Positioning control words 1 and 2 and status word 1. CONTINUOUS_UPDATE: new MDI values count at once, without a new
+# edge of ACTIVATE_TASK.
+PosSTW1 = IntFlag("PosSTW1", {"ABSOLUTE": 1 << 8, "CONTINUOUS_UPDATE": 1 << 12, "MDI": 1 << 15})
+PosSTW2 = IntFlag("PosSTW2", {"SOFTWARE_LIMITS": 1 << 14, "HARDWARE_LIMITS": 1 << 15})
+PosZSW1 = IntFlag("PosZSW1", {"HOMING": 1 << 11, "MDI": 1 << 15})
 
 POWERED = (
     STW1.NO_COAST_STOP | STW1.NO_QUICK_STOP | STW1.ENABLE_OPERATION | STW1.CONTROL_BY_PLC | STW1.NO_INTERMEDIATE_STOP
@@ -111,7 +90,7 @@ POWERED = (
 
 
 @dataclass(frozen=True)
-class CmmtProfile:
+class CmmtProfile(AxisProfile):
     """Telegram 111 with the units of the drive's set-up.
 
     position_unit      [m] a count of MDI_TARPOS and XIST_A
@@ -131,13 +110,7 @@ class CmmtProfile:
     write_address = OUTPUT_ADDRESS
     read_address = INPUT_ADDRESS
     read_count = BLOCK
-
-    def __post_init__(self) -> None:
-        for name in ("position_unit", "velocity_unit", "base_velocity", "base_acceleration"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise ValueError(
-                    f"CmmtProfile.{name} is {getattr(self, name)}, it must be positive, as in the drive's set-up"
-                )
+    faults = CMMT_FAULTS
 
     def encode(self, command: AxisCommand) -> list[int]:
         stw1 = POWERED
@@ -168,18 +141,19 @@ class CmmtProfile:
         return [*struct.unpack(f"<{WORDS}H", words), *[0] * (BLOCK - WORDS)]
 
     def decode(self, registers: list[int]) -> AxisStatus:
-        expect_count(registers, BLOCK)
-        zsw1, pos_zsw1 = registers[0], registers[1]
+        self.expect_count(registers)
+        zsw1, pos_zsw1, *_, fault_code, warning_code = registers[:WORDS]
+        position, velocity = struct.unpack("<ii", struct.pack("<4H", *registers[5:9]))
         return AxisStatus(
             ready=bool(zsw1 & ZSW1.READY_TO_SWITCH_ON and zsw1 & ZSW1.CONTROL_REQUESTED),
             enabled=bool(zsw1 & ZSW1.OPERATION_ENABLED),
             fault=bool(zsw1 & ZSW1.FAULT),
-            fault_code=registers[9],
-            warning_code=registers[10],
+            fault_code=fault_code,
+            warning_code=warning_code,
             homing=bool(pos_zsw1 & PosZSW1.HOMING),
             homed=bool(zsw1 & ZSW1.HOME_SET),
-            position=signed(registers[5] | registers[6] << 16, 32) * self.position_unit,
-            velocity=signed(registers[7] | registers[8] << 16, 32) * self.base_velocity / N4,
+            position=position * self.position_unit,
+            velocity=velocity * self.base_velocity / N4,
         )
 
     def set_up(self, link: RegisterLink, node_guard: float) -> Iterator[None]:
@@ -211,6 +185,3 @@ class CmmtProfile:
             found, given = 10.0**value if key.endswith("unit") else value, getattr(self, key)
             if not abs(found - given) <= SAME * given:
                 raise SetUpError("units", f"its {key} is {found:g} (parameter {number}), robot.yaml has {given:g}")
-
-    def fault_text(self, code: int) -> str:
-        return fault_text(code, CMMT_FAULTS)

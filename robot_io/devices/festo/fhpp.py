@@ -10,72 +10,35 @@ registers and function code 0x17: GDCP-CMMO-ST-LK-C-HP-EN, 4.3. One per cent of 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 
-from robot_io.devices.festo.faults import FHPP_FAULTS, fault_text
-from robot_io.devices.festo.modbus_link import RegisterLink
-from robot_io.devices.festo.profile import INT32, AxisCommand, AxisStatus, count_of, expect_count
+from robot_io.devices.festo.profile import INT32, AxisCommand, AxisProfile, AxisStatus, count_of
 
 ADDRESS, REGISTERS = 0, 4
 
 
-class CCON(IntFlag):
-    """Control byte 1."""
-
-    ENABLE = 1 << 0
-    STOP = 1 << 1  # 0: emergency ramp
-    BRAKE = 1 << 2
-    RESET = 1 << 3
-    LOCK = 1 << 5  # keeps the set-up tool from taking over
-    OPM1 = 1 << 6  # direct mode
+# Numbers: GDCP-CMMO-ST-LK-C-HP-EN and EMCA-EC-C-HP-EN.
+FHPP_FAULTS = {
+    0: "the number is in the drive's diagnostic memory, read it with Festo's Configuration Tool",
+    0x47: "Modbus connection timed out (node guard)",
+    0x48: "Modbus connection timed out (node guard)",
+}
 
 
-class CPOS(IntFlag):
-    """Control byte 2."""
-
-    HALT = 1 << 0  # 0: brake
-    START = 1 << 1
-    HOM = 1 << 2
-    CLEAR = 1 << 6  # a rising edge drops the rest of a halted task
-
-
-class CDIR(IntFlag):
-    """Control byte 3; 0 is an absolute position."""
-
-    RELATIVE = 1 << 0
-    COM1 = 1 << 1
-    COM2 = 1 << 2
-    CONT = 1 << 3
-    CONTT = 1 << 4
-
-
-class SCON(IntFlag):
-    """Status byte 1."""
-
-    ENABLED = 1 << 0
-    OPEN = 1 << 1  # operation enabled
-    WARN = 1 << 2
-    FAULT = 1 << 3
-    VLOAD = 1 << 4
-    FCT = 1 << 5  # the set-up tool has control
-    OPM1 = 1 << 6
-
-
-class SPOS(IntFlag):
-    """Status byte 2."""
-
-    HALT = 1 << 0
-    ACK = 1 << 1
-    MC = 1 << 2  # motion complete
-    MOV = 1 << 4
-    DEV = 1 << 5  # following error
-    REF = 1 << 7
+# Control bytes 1 to 3 and status bytes 1 and 2, bits in their order from 0 on. Without STOP the drive brakes by its
+# emergency ramp, without HALT it brakes; a rising edge of CLEAR drops the rest of a halted task; LOCK keeps the set-up
+# tool from taking over, FCT says that it has; OPM1 is direct mode; a CDIR of 0 is an absolute position; OPEN: operation
+# enabled; MC: motion complete; DEV: following error.
+CCON = IntFlag("CCON", "ENABLE STOP BRAKE RESET RESERVED LOCK OPM1")
+CPOS = IntFlag("CPOS", "HALT START HOM JOGP JOGN TEACH CLEAR")
+CDIR = IntFlag("CDIR", "RELATIVE COM1 COM2 CONT CONTT")
+SCON = IntFlag("SCON", "ENABLED OPEN WARN FAULT VLOAD FCT OPM1")
+SPOS = IntFlag("SPOS", "HALT ACK MC TEACH MOV DEV STILL REF")
 
 
 @dataclass(frozen=True)
-class FhppProfile:
+class FhppProfile(AxisProfile):
     """FHPP direct mode with the units of the drive's set-up.
 
     position_unit  [m] a count of the position
@@ -93,13 +56,7 @@ class FhppProfile:
     write_address = ADDRESS
     read_address = ADDRESS
     read_count = REGISTERS
-
-    def __post_init__(self) -> None:
-        for name in ("position_unit", "base_velocity"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise ValueError(
-                    f"FhppProfile.{name} is {getattr(self, name)}, it must be positive, as in the drive's set-up"
-                )
+    faults = FHPP_FAULTS
 
     def encode(self, command: AxisCommand) -> list[int]:
         ccon = CCON.STOP | CCON.BRAKE | CCON.LOCK | CCON.OPM1
@@ -122,7 +79,7 @@ class FhppProfile:
         return list(struct.unpack(">4H", struct.pack(">BBBBi", ccon, cpos, cdir, speed, position)))
 
     def decode(self, registers: list[int]) -> AxisStatus:
-        expect_count(registers, REGISTERS)
+        self.expect_count(registers)
         scon, spos, _, percent, position = struct.unpack(">BBBbi", struct.pack(">4H", *registers))
         return AxisStatus(
             ready=bool(scon & SCON.VLOAD) and not scon & (SCON.FAULT | SCON.FCT),
@@ -135,9 +92,3 @@ class FhppProfile:
             position=position * self.position_unit,
             velocity=percent * self.base_velocity / 100.0,
         )
-
-    def set_up(self, link: RegisterLink, node_guard: float) -> Iterator[None]:
-        yield from ()
-
-    def fault_text(self, code: int) -> str:
-        return fault_text(code, FHPP_FAULTS)

@@ -1,4 +1,4 @@
-"""Links that carry registers to an axis: over Modbus TCP, or straight into an emulator in the same process."""
+"""The link that carries registers to an axis over Modbus TCP."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Protocol
 
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
-from pymodbus.pdu import ExceptionResponse
 
 DEFAULT_PORT = 502
 RETRY = 0.5  # [s] between attempts to connect: a dead axis must not slow down the exchange with the living one
@@ -24,40 +23,16 @@ EXCEPTIONS = {
 
 
 class AxisLost(ConnectionError):
-    """An exchange with an axis failed; ``reason`` says how."""
-
-    def __init__(self, reason: str):
-        super().__init__(reason)
-        self.reason = reason
+    """An exchange with an axis failed; the message says how."""
 
 
-class Exchange(Protocol):
-    """Registers that are written and read in one go."""
+class RegisterLink(Protocol):
+    """One axis's register bank behind a connection, or an emulator's in the same process."""
 
     def exchange(self, write_address: int, values: list[int], read_address: int, count: int) -> list[int]:
         """Writes ``values`` from ``write_address`` on, then reads ``count`` registers. Raises AxisLost."""
 
-
-class RegisterLink(Exchange, Protocol):
-    """One axis's register bank behind a connection."""
-
     def close(self) -> None: ...
-
-
-class DirectLink:
-    """Calls an emulator's register bank in this process.
-
-    bank: anything with ``exchange``, such as ``robot_io.emulator.axes.AxisEmulator``.
-    """
-
-    def __init__(self, bank: Exchange) -> None:
-        self._bank = bank
-
-    def exchange(self, write_address: int, values: list[int], read_address: int, count: int) -> list[int]:
-        return self._bank.exchange(write_address, values, read_address, count)
-
-    def close(self) -> None:
-        pass
 
 
 class ModbusLink:
@@ -102,11 +77,9 @@ class ModbusLink:
         except ModbusIOException as error:
             reason = f"no sound answer within {self._timeout:g} s: is it powered, is the cable in?"
             raise self._lost(reason) from error
-        except (
-            Exception
-        ) as error:  # whatever a damaged answer or a dying socket raises inside pymodbus: the axis is lost
+        except Exception as error:  # whatever a damaged answer or a dying socket raises inside pymodbus
             raise self._lost(str(error) or type(error).__name__) from error
-        if isinstance(answer, ExceptionResponse) or answer.isError():
+        if answer.isError():
             code = getattr(answer, "exception_code", 0)
             raise self._lost(
                 f"it refused registers {write_address} and {read_address}: {EXCEPTIONS.get(code, f'exception {code}')}"

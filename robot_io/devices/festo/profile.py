@@ -5,13 +5,15 @@ Positions are in the drive's own coordinate, in metres; only the codecs (``cmmt`
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 from robot_io.devices.festo.modbus_link import RegisterLink
 
 INT32 = (-(2**31), 2**31 - 1)
+UNKNOWN_FAULT = "look the number up in the drive's manual"
 
 
 class SetUpError(ValueError):
@@ -71,21 +73,33 @@ class AxisStatus:
     velocity: float
 
 
-class AxisProfile(Protocol):
-    """Registers of one kind of drive.
+@dataclass(frozen=True)
+class AxisProfile(ABC):
+    """Registers of one kind of drive; its fields are the units of the drive's set-up.
 
     write_address  first register of the process data that the drive takes
     read_address   first register of the process data that it gives
     read_count     how many of those
+    faults         the drive's fault numbers in words: those that an axis on a gantry can meet
     """
 
-    write_address: int
-    read_address: int
-    read_count: int
+    write_address: ClassVar[int]
+    read_address: ClassVar[int]
+    read_count: ClassVar[int]
+    faults: ClassVar[dict[int, str]]
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, bool) and not 0 < value < 1e6:
+                raise ValueError(
+                    f"{type(self).__name__}.{name} is {value}, it must be positive, as in the drive's set-up"
+                )
+
+    @abstractmethod
     def encode(self, command: AxisCommand) -> list[int]:
         """Registers to write; ValueError when a number does not fit."""
 
+    @abstractmethod
     def decode(self, registers: list[int]) -> AxisStatus:
         """Status from ``read_count`` registers; ValueError on another length."""
 
@@ -95,9 +109,15 @@ class AxisProfile(Protocol):
         Raises SetUpError where the drive would not stop by itself or counts otherwise. Nothing where its set-up tool
         alone sets and shows these.
         """
+        yield from ()
+
+    def expect_count(self, registers: list[int]) -> None:
+        if len(registers) != self.read_count:
+            raise ValueError(f"{len(registers)} registers arrived, the profile has {self.read_count}")
 
     def fault_text(self, code: int) -> str:
-        """The drive's fault number in words."""
+        """The drive's fault number and its words."""
+        return f"{code}: {self.faults.get(code, UNKNOWN_FAULT)}"
 
 
 def count_of(value: float, unit: float, bounds: tuple[int, int], what: str) -> int:
@@ -107,14 +127,3 @@ def count_of(value: float, unit: float, bounds: tuple[int, int], what: str) -> i
         low, high = (b * unit for b in bounds)
         raise ValueError(f"{what} {value} does not fit its register, allowed is {low:g} to {high:g} at {unit:g} a unit")
     return round(scaled)
-
-
-def expect_count(registers: list[int], count: int) -> None:
-    if len(registers) != count:
-        raise ValueError(f"{len(registers)} registers arrived, the profile has {count}")
-
-
-def signed(value: int, bits: int) -> int:
-    """The two's complement number held in the lowest ``bits`` bits."""
-    half = 1 << (bits - 1)
-    return (value & (2 * half - 1)) - ((value & half) << 1)

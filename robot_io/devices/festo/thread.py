@@ -4,34 +4,30 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from numpy.typing import ArrayLike
-
-from robot_io.devices.festo.axes import FestoAxes
-from robot_io.devices.festo.config import AxesState
+from robot_io.devices.festo.axes import DEFAULTS, FestoAxes
+from robot_io.devices.festo.axis import AxesConfig, Axis
 
 STOPPING = 1.0  # [s] for coming to rest at the end
 
 
-class AxesThread:
-    """Calls ``axes.cycle`` at ``rate`` [Hz] by absolute deadlines, from ``start`` (entering) to ``close`` (leaving).
+class AxesThread(FestoAxes):
+    """Calls ``cycle`` at ``rate`` [Hz] by absolute deadlines, from ``start`` (entering) to ``close`` (leaving).
 
-    The axes hand over commands, requests and state as single immutable objects, so no lock is held across an exchange
-    and nobody waits for one.
+    Commands, requests and state are handed over as single immutable objects, so no lock is held across an exchange and
+    nobody waits for one. Times are those of ``time.monotonic``.
 
     cycles    done
     late      deadlines that had passed by a whole period when their cycle would have begun; those are left out
-    longest   cycle [s]
     """
 
-    def __init__(self, axes: FestoAxes, rate: float = 125.0):
+    def __init__(self, axes: Sequence[Axis], config: AxesConfig = DEFAULTS, rate: float = 125.0):
         if not 10.0 <= rate <= 1000.0:
             raise ValueError(f"rate {rate} Hz must be in 10..1000")
-        self.axes = axes
+        super().__init__(axes, config)
         self.cycles = 0
         self.late = 0
-        self.longest = 0.0
         self._period = 1.0 / rate
         self._finish = threading.Event()
         self._failure: str | None = None
@@ -53,40 +49,9 @@ class AxesThread:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def command(self, position: ArrayLike, velocity: ArrayLike, now: float) -> None:
-        """As ``FestoAxes.command``; ``now`` of ``time.monotonic``."""
-        self.axes.command(position, velocity, now)
-
-    def enable(self) -> None:
-        self.axes.enable()
-
-    def home(self) -> None:
-        self.axes.home()
-
-    def acknowledge(self) -> None:
-        self.axes.acknowledge()
-
-    def stop(self) -> None:
-        self.axes.stop()
-
-    def disable(self) -> None:
-        self.axes.disable()
-
-    @property
-    def state(self) -> AxesState | None:
-        return self.axes.state
-
-    @property
-    def homed(self) -> bool:
-        return self.axes.homed
-
-    @property
-    def homing(self) -> bool:
-        return self.axes.homing
-
     def preparable(self, now: float) -> bool:
         """As ``FestoAxes.preparable``, while the thread runs."""
-        return self._failure is None and self._thread.is_alive() and self.axes.preparable(now)
+        return self._failure is None and self._thread.is_alive() and super().preparable(now)
 
     def problem(self, now: float) -> str | None:
         """As ``FestoAxes.problem``; also that the thread has ended, which lasts."""
@@ -94,7 +59,7 @@ class AxesThread:
             return self._failure
         if not self._thread.is_alive():
             return "The exchange with the linear axes is not running: start it."
-        return self.axes.problem(now)
+        return super().problem(now)
 
     def _run(self) -> None:
         try:
@@ -109,11 +74,9 @@ class AxesThread:
     def _loop(self, finished: Callable[[], bool]) -> None:
         deadline = time.monotonic()
         while not finished():
-            began = time.monotonic()
-            self.axes.cycle(began)
+            self.cycle(time.monotonic())
             self.cycles += 1
             after = time.monotonic()
-            self.longest = max(self.longest, after - began)
             deadline += self._period
             missed = int((after - deadline) / self._period)
             if missed > 0:
@@ -126,13 +89,13 @@ class AxesThread:
         """Stops, waits until the axes stand, switches them off. What fails here is left to the drives' node guards."""
         try:
             limit = time.monotonic() + STOPPING
-            self.axes.stop()
-            self.axes.cycle(time.monotonic())  # at least this one stop command
-            self._loop(lambda: self.axes.standing() or time.monotonic() > limit)
+            self.stop()
+            self.cycle(time.monotonic())  # at least this one stop command
+            self._loop(lambda: self.standing or time.monotonic() > limit)
         except Exception as error:
             self._failure = (
                 self._failure or f"The linear axes could not be stopped in order ({type(error).__name__}: {error})."
             )
         finally:
-            self.axes.switch_off()
-            self.axes.close()
+            self.switch_off()
+            super().close()

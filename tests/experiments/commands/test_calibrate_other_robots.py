@@ -15,8 +15,8 @@ from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import UNCALIBRATED
 from robot_io.control.interfaces import BridgeConfig
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.lockstep import LockStep
-from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.emulator.world import World
 from tests.support.hidden_rig import touches
 from tests.support.lockstep_play import throws

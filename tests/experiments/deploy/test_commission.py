@@ -19,9 +19,9 @@ from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.processes import Rig
-from robot_io.emulator.tracker.hidden import HiddenErrors
 from tests.support.commissioning_rig import LockStepHands, LockStepSession, Person
 from tests.support.lockstep_play import throws
 from tests.support.paths import ROOT

@@ -18,7 +18,7 @@ from robot_io.devices.ball_datagram import BallSample, encode
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
-from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, DirectLink, FestoAxes
+from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_drive import DriveParams
@@ -83,10 +83,7 @@ def to_bridge(motion, delays, unit=FINEST):
     emulators = [AxisEmulator("cmmt", 0.0, 0.0, 10.0, drive, AxisUnits(position=unit)) for _ in FESTO_JOINTS]
     profile = CmmtProfile(position_unit=unit)
     axes = FestoAxes(
-        [
-            Axis(name, DirectLink(emulator), profile, -0.99, 0.99)
-            for name, emulator in zip("xy", emulators, strict=True)
-        ],
+        [Axis(name, emulator, profile, -0.99, 0.99) for name, emulator in zip("xy", emulators, strict=True)],
         AxesConfig(max_error=9.0),
     )
     session = EgmSession(EgmConfig(controller_address=HOME, ramp_in=0.0))

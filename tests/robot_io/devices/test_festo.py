@@ -19,14 +19,16 @@ from robot_io.devices.festo import (
     AxisCommand,
     AxisLost,
     CmmtProfile,
-    DirectLink,
     FestoAxes,
     FhppProfile,
     ModbusLink,
 )
-from robot_io.devices.festo.channel import Channel
+from robot_io.devices.festo.axis import Channel
 from robot_io.devices.festo.profile import AxisStatus
-from robot_io.emulator.axes import AxisEmulator, AxisUnits, DriveParams, serve
+from robot_io.emulator.axes import AxisEmulator
+from robot_io.emulator.axis_drive import DriveParams
+from robot_io.emulator.axis_registers import AxisUnits
+from robot_io.emulator.axis_server import AxisServer
 from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
@@ -64,7 +66,7 @@ def test_an_axis_that_was_pushed_away_is_held_where_it_stands_then():
         channel.hold(now)
         held.append(channel.held)
     assert held[10] == 0.1 and held[-1] == 0.15
-    channel.follow()
+    channel.release()
     channel.hold(now + 5.0)  # after a silence nothing says that it stands
     assert channel.held is None
 
@@ -92,22 +94,20 @@ def test_output_registers_of_telegram_111(command, start):
     assert CmmtProfile().encode(command) == start + [0] * 17
 
 
+def states(status):
+    return status.ready, status.enabled, status.fault, status.homed, status.homing
+
+
 def test_input_registers_of_telegram_111():
     # Operating, homed; -250000 um; -0.5 of 0x40000000, so -1 m/s of 2 m/s; warning 12.
     words = [0x2F37, 0x8000, 0, 0, 0, 0x2F70, 0xFFFC, 0x0000, 0xE000, 0, 12]
     status = CmmtProfile().decode(words + [0] * 17)
     assert status.position == pytest.approx(-0.25, abs=1e-12) and status.velocity == pytest.approx(-1.0, abs=1e-12)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (True, True, False, True, False)
+    assert states(status) == (True, True, False, True, False)
     assert (status.fault_code, status.warning_code) == (0, 12)
     # Fault, inhibited; homing active; fault 126.
     status = CmmtProfile().decode([0x0248, 0x0800, 0, 0, 0, 0, 0, 0, 0, 126, 0] + [0] * 17)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
-        False,
-        False,
-        True,
-        False,
-        True,
-    )
+    assert states(status) == (False, False, True, False, True)
     assert status.fault_code == 126 and "following error" in CmmtProfile().fault_text(126)
     assert CmmtProfile().fault_text(999).startswith("999: look")
 
@@ -140,15 +140,9 @@ def test_input_registers_of_fhpp():
     # SCON: enabled, open, load voltage, OPM1 = 0x53; SPOS: halt off, moving, referenced = 0x91; -50 % = 0xCE
     status = FhppProfile().decode([0x5391, 0x00CE, 0xFFFF, 0x9E58])
     assert status.position == pytest.approx(-0.25, abs=1e-12) and status.velocity == pytest.approx(-1.0, abs=1e-12)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (True, True, False, True, False)
+    assert states(status) == (True, True, False, True, False)
     status = FhppProfile().decode([0x1800, 0, 0, 0])  # load voltage, fault
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
-        False,
-        False,
-        True,
-        False,
-        False,
-    )
+    assert states(status) == (False, False, True, False, False)
     assert not FhppProfile().decode([0x3000, 0, 0, 0]).ready  # the set-up tool has control
 
 
@@ -168,7 +162,7 @@ def test_numbers_that_do_not_fit(profile):
 
 def test_modbus_link_both_ways_of_asking():
     emulator = AxisEmulator("cmmt")
-    with serve(emulator) as server:
+    with AxisServer(emulator) as server:
         for combined in (True, False):
             link = ModbusLink("127.0.0.1", server.port, timeout=1.0, combined=combined)
             image = CmmtProfile().encode(AxisCommand(position=0.1 + combined))
@@ -181,7 +175,7 @@ def test_modbus_link_both_ways_of_asking():
 def test_modbus_link_says_what_is_wrong():
     emulator = AxisEmulator("cmmt")
     image = CmmtProfile().encode(AxisCommand())
-    with serve(emulator) as server:
+    with AxisServer(emulator) as server:
         wrong_id = ModbusLink("127.0.0.1", server.port, timeout=1.0, device_id=9)
         with pytest.raises(AxisLost, match="device id 9: it refused"):
             wrong_id.exchange(0, image, 100, 28)
@@ -312,8 +306,8 @@ def test_targets_stay_within_the_axis(profile):
 
 def test_axes_may_count_the_other_way_round():
     rig = LockStep(start=(0.2, -0.1))
-    axes = [Axis("x", DirectLink(rig.emulators[0]), CmmtProfile(), -1.0, 1.0, zero=0.5, direction=-1)]
-    axes += [Axis("y", DirectLink(rig.emulators[1]), CmmtProfile(), -0.5, 0.5)]
+    axes = [Axis("x", rig.emulators[0], CmmtProfile(), -1.0, 1.0, zero=0.5, direction=-1)]
+    axes += [Axis("y", rig.emulators[1], CmmtProfile(), -0.5, 0.5)]
     rig.axes = FestoAxes(axes)
     rig.start()
     np.testing.assert_allclose(rig.axes.state.position, [0.3, -0.1], atol=1e-6)  # 0.5 - 0.2
@@ -383,7 +377,7 @@ def test_losing_either_axis_stops_the_other_in_the_same_cycle(lost):
     rig.emulators[lost].disconnect()
     stream(rig.now)
     rig.axes.cycle(rig.now)
-    assert not other.outputs[0] & 0x0040  # no task any more
+    assert not other.bank.outputs[0] & 0x0040  # no task any more
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -393,7 +387,7 @@ def test_a_fault_stops_both_and_stays_until_acknowledged(profile):
     rig.emulators[1].inject_fault(51)
     rig.run(0.3, stream)
     problem = rig.axes.problem(rig.now)
-    assert rig.axes.fault.cause == "drive_fault"
+    assert rig.axes.fault.cause == "drive_fault" and not rig.axes.preparable(rig.now)
     assert ("51: power unit too hot" if profile == "cmmt" else "diagnostic memory") in problem
     assert abs(rig.velocity[0]) < 0.002 and rig.position[0] - before < longest_stop()
     for request in (rig.axes.enable, rig.axes.home):  # not before it is acknowledged
@@ -583,9 +577,9 @@ def test_stop_and_disable():
     rig.axes.stop()
     stop = rig.now
     rig.run(0.3, lambda now: rig.axes.command((0.0, 0.0), (0.5, 0.0), stop))  # commands from before count no more
-    assert abs(rig.velocity[0]) < 0.002 and rig.axes.problem(rig.now) is None and rig.axes.standing()
+    assert abs(rig.velocity[0]) < 0.002 and rig.axes.problem(rig.now) is None and rig.axes.standing
     rig.run(0.3, Stream(rig, steady))
-    assert rig.velocity[0] > 0.4 and not rig.axes.standing()
+    assert rig.velocity[0] > 0.4 and not rig.axes.standing
     rig.axes.disable()
     rig.run(0.3, stream)
     assert not any(e.drive.operating for e in rig.emulators) and abs(rig.velocity[0]) < 1e-3
@@ -595,9 +589,9 @@ def test_stop_and_disable():
 def test_problems_before_the_first_motion():
     rig = LockStep(config=AxesConfig(homing_timeout=0.5, enable_timeout=0.5))
     command = lambda now: rig.axes.command((0.2, -0.1), (0.0, 0.0), now)  # noqa: E731
-    assert rig.axes.state is None and "not answered yet" in rig.axes.problem(0.0)
+    assert rig.axes.state is None and "not answered yet" in rig.axes.problem(0.0) and not rig.axes.preparable(0.0)
     rig.run(0.1, command)
-    assert "x and y are switched off" in rig.axes.problem(rig.now)
+    assert "x and y are switched off" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
     rig.axes.enable()
     rig.run(0.2, command)
     assert "x and y are not homed" in rig.axes.problem(rig.now)
@@ -614,21 +608,14 @@ def test_problems_before_the_first_motion():
     assert rig.axes.fault.cause == "enable_timeout" and "load voltage" in rig.axes.problem(rig.now)
 
 
-def test_a_drive_that_does_not_take_the_node_guard():
-    rig = LockStep(wrap=NoGuard, node_guard=1.0)
-    rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "[100, 0] as [1000, 0]" in rig.axes.problem(rig.now)
-    assert LockStep(node_guard=5.0).start().emulators[0].node_guard == 0.1  # one that does
-
-
-class NoGuard(DirectLink):
+class NoGuard(AxisEmulator):
     """A drive that answers the node guard with what was written, and does not take it."""
 
     def exchange(self, write_address, values, read_address, count):
         return values if write_address == 400 else super().exchange(write_address, values, read_address, count)
 
 
-class SwappedGuard(DirectLink):
+class SwappedGuard(AxisEmulator):
     """The words of a drive's node guard come high word first."""
 
     def exchange(self, write_address, values, read_address, count):
@@ -637,54 +624,44 @@ class SwappedGuard(DirectLink):
         return answer[::-1] if read_address == 400 else answer
 
 
-def test_a_node_guard_whose_words_are_swapped_is_refused():
-    rig = LockStep(wrap=SwappedGuard, node_guard=1.0)
-    rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "are its words swapped" in rig.axes.problem(rig.now)
-    assert rig.emulators[0].node_guard == 1.0
+class NoUnit(AxisEmulator):
+    """A drive that does not tell one of its units."""
+
+    def __init__(self, *arguments, **keywords):
+        super().__init__(*arguments, **keywords)
+        self.bank._parameters.pop((12346, 0))
 
 
 @pytest.mark.parametrize(
-    ("units", "says"),
+    ("options", "cause", "says"),
     [
-        (dict(base_acceleration=7.5), "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
-        (dict(base_velocity=1.0), "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
-        (dict(position=1e-5), "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
-        (dict(velocity=1e-4), "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
+        (dict(kind=NoGuard, node_guard=1.0), "node_guard", "[100, 0] as [1000, 0]"),
+        (dict(kind=SwappedGuard, node_guard=1.0), "node_guard", "are its words swapped"),
+        (dict(kind=NoUnit), "units", "does not tell parameter 12346"),
+        (dict(base_acceleration=7.5), "units", "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
+        (dict(base_velocity=1.0), "units", "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
+        (dict(position=1e-5), "units", "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
+        (dict(velocity=1e-4), "units", "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
     ],
 )
-def test_a_drive_that_counts_otherwise_gets_no_power(units, says):
-    rig = LockStep(units=AxisUnits(**{"position": 1e-6, **units}))
+def test_a_drive_that_would_not_stop_by_itself_or_counts_otherwise_gets_no_power(options, cause, says):
+    """The operator's whole request at once, again and again: acknowledge, enable, home."""
+    units = None if "kind" in options else AxisUnits(**{"position": 1e-6, **options})
+    rig = LockStep(**(options if "kind" in options else {"units": units}))
     rig.run(0.2)
-    for request in (rig.axes.acknowledge, rig.axes.enable):
-        request()
-    rig.run(0.5)
-    assert rig.axes.fault.cause == "units" and says in rig.axes.problem(rig.now)
-    assert not any(emulator.drive.operating for emulator in rig.emulators)
-
-
-def test_a_drive_that_tells_no_units_gets_no_power():
-    rig = LockStep()
-    for emulator in rig.emulators:
-        emulator._parameters.pop((12346, 0))
-    rig.axes.enable()
-    rig.run(0.5)
-    assert rig.axes.fault.cause == "units" and "12346" in rig.axes.problem(rig.now)
-    assert not any(emulator.drive.operating for emulator in rig.emulators)
-
-
-def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
-    """The operator's whole request at once: acknowledge, enable, home."""
-    rig = LockStep(wrap=NoGuard, node_guard=1.0)
-    rig.run(0.05)
     for _ in range(3):
+        assert rig.axes.fault.cause == cause and says in rig.axes.problem(rig.now)
         for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
             request()
         rig.run(0.5)
-        assert rig.axes.fault.cause == "node_guard"
         for emulator in rig.emulators:
-            assert not emulator.outputs[0] & 0x0801  # ON, START_HOMING
+            assert not emulator.bank.outputs[0] & 0x0801  # ON, START_HOMING
             assert not emulator.drive.operating and not emulator.drive.homing and not emulator.drive.homed
+            assert options.get("node_guard") in (None, emulator.bank.node_guard)
+
+
+def test_the_node_guard_of_robot_yaml_is_the_drives():
+    assert LockStep(node_guard=5.0).start().emulators[0].bank.node_guard == AxesConfig().node_guard
 
 
 def homing(profile="cmmt"):
@@ -713,7 +690,7 @@ def test_an_axis_that_is_gone_ends_the_other_ones_homing(profile, gone, how):
     before = other.images
     rig.axes.cycle(rig.now)
     assert other.images > before and not rig.axes.homing
-    assert not other.outputs[0] & (0x0800 if profile == "cmmt" else 0x0004)  # START_HOMING, HOM
+    assert not other.bank.outputs[0] & (0x0800 if profile == "cmmt" else 0x0004)  # START_HOMING, HOM
     rig.run(0.1)
     assert not other.drive.homing and other.drive.operating  # it holds
     rig.emulators[gone].reconnect()
@@ -750,24 +727,12 @@ def test_a_drive_gets_no_power_while_a_fault_is_latched():
     assert not any(emulator.drive.operating for emulator in rig.emulators)
 
 
-def test_what_switching_on_and_homing_mend_is_told_apart():
-    rig = LockStep()
-    assert not rig.axes.preparable(rig.now)  # they have not answered
-    rig.run(0.1)
-    assert "switched off" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
-    rig.start()
-    assert rig.axes.preparable(rig.now)
-    rig.emulators[0].inject_fault(51)
-    rig.run(0.1)
-    assert not rig.axes.preparable(rig.now)
-
-
 def test_commands_are_checked():
     axes = LockStep().axes
     for position, velocity in [((0, np.nan), (0, 0)), ((0, 0), (np.inf, 0)), ((0, 0, 0), (0, 0)), ((0, 0), 0.0)]:
         with pytest.raises(ValueError, match="2 finite numbers"):
             axes.command(position, velocity, 0.0)
-    link = DirectLink(AxisEmulator())
+    link = AxisEmulator()
     with pytest.raises(ValueError, match="below upper"):
         Axis("x", link, CmmtProfile(), 1.0, -1.0)
     with pytest.raises(ValueError, match="direction"):
@@ -791,7 +756,7 @@ class RealTime:
         self.emulators = [AxisEmulator(kind) for _ in range(2)]
         self.position, self.velocity = np.zeros(2), np.zeros(2)
         self.step(time.monotonic(), 0.0)
-        self.servers = [serve(e) for e in self.emulators]
+        self.servers = [AxisServer(e) for e in self.emulators]
         self.finish = threading.Event()
         self.thread = threading.Thread(target=self.run, daemon=True)
 
@@ -822,7 +787,7 @@ class RealTime:
         # Generous times: what is tested is the order of things, on a machine that may be busy.
         config = AxesConfig(node_guard=1.0, command_timeout=0.5, state_timeout=0.5)
         links = [ModbusLink("127.0.0.1", s.port, timeout=0.5) for s in self.servers]
-        return FestoAxes([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links, strict=True)], config)
+        return AxesThread([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links, strict=True)], config)
 
 
 def wait_for(condition, seconds=10.0):
@@ -836,7 +801,7 @@ def wait_for(condition, seconds=10.0):
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp"])
 def test_over_tcp_in_real_time(profile):
     with RealTime(profile) as rig:
-        with AxesThread(rig.axes()) as thread:
+        with rig.axes() as thread:
             wait_for(lambda: thread.state is not None)
             thread.enable()
             wait_for(lambda: thread.state.enabled)
@@ -860,15 +825,14 @@ def test_over_tcp_in_real_time(profile):
 def test_thread_stops_the_axes_when_it_breaks(broken):
     """An error that nobody thought of, in one axis's exchange: the other is stopped and switched off."""
     with RealTime() as rig:
-        axes = rig.axes()
-        with AxesThread(axes) as thread:
+        with rig.axes() as thread:
             thread.enable()
             wait_for(lambda: thread.state is not None and thread.state.enabled)
 
             def exchange(*arguments):
                 raise ZeroDivisionError("unforeseen")
 
-            axes._channels[broken].axis.link.exchange = exchange
+            thread._channels[broken].axis.link.exchange = exchange
             wait_for(lambda: "broke off (ZeroDivisionError: unforeseen)" in (thread.problem(time.monotonic()) or ""))
             wait_for(lambda: not rig.emulators[1 - broken].drive.operating, seconds=0.9)  # before its node guard
             assert "restart the program" in thread.problem(time.monotonic())

@@ -12,8 +12,8 @@ from robot_io.devices.ball_datagram import BallSample
 from robot_io.devices.frame_check import NEEDED, FrameCheck
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.tracker import TrackerParams
-from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.errors import RefusedError
 from tests.support.lockstep_play import lockstep, playing
 

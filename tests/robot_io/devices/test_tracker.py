@@ -109,11 +109,7 @@ def test_impossible_positions_are_refused(number):
         with pytest.raises(ValueError, match="position"):
             decode(resealed(GOLDEN[:place] + struct.pack("<d", number) + GOLDEN[place + 8 :]))
     with pytest.raises(ValueError, match="position"):
-        if abs(number) > 1e100 or number != number:
-            encode(BallSample(0, 1, 0.0, np.array([number, 0.0, 0.0 if number == number else 1.0])))
-            decode(frame(0, 0.0, position=(number, 0, 0)))
-        else:
-            decode(frame(0, 0.0, position=(number, 0, 0)))
+        decode(frame(0, 0.0, position=(number, 0, 0)))
 
 
 def test_what_is_refused_is_counted_and_changes_nothing():

@@ -40,7 +40,7 @@ class World:
         while self.now >= self.wakes and self.published + STEP <= self.now and steps < self.most:
             self.published, steps = self.published + STEP, steps + 1
             each = np.full(N_JOINTS, SPEED)
-            self.shared.publish(self.published, each * self.published, each, np.zeros(3), 0, False, 0, 0)
+            self.shared.publish(time=self.published, qpos=each * self.published, qvel=each)
 
     def monotonic(self):
         return self.now
@@ -77,7 +77,7 @@ def test_a_device_that_begins_before_the_world_waits_for_it(monkeypatch):
         nonlocal now
         now += seconds
         if not shared["version"][0] and now > 6.0:
-            shared.publish(now, np.full(N_JOINTS, 0.5), np.zeros(N_JOINTS), np.zeros(3), 0, False, 0, 0)
+            shared.publish(time=now, qpos=0.5, qvel=0.0)
 
     monkeypatch.setattr(shared_state, "clock", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
     position, _ = Motion(shared).at(now)

@@ -34,6 +34,17 @@ def spin_of(world):
     return rotation.reshape(3, 3) @ world.data.qvel[world._ball_v + 3 : world._ball_v + 6]
 
 
+def impact(world, setpoint=STILL):
+    """The ball's velocity (3,) [m/s] before its first touch, which is over then."""
+    before = world.ball_velocity
+    while not world.touches:
+        before = world.ball_velocity
+        world.advance(setpoint, 0.0005)
+    while world._touching:
+        world.advance(setpoint, 0.0005)
+    return before
+
+
 def fly(world, seconds, step=0.001):
     """(n, 7): time, position and velocity after each step."""
     rows = []
@@ -85,12 +96,7 @@ def test_magnus_pushes_across_spin_and_velocity():
 def test_bounce_on_the_table(world, down, along, spin):
     velocity, omega = np.array([0.2 * along, along, -down]), np.array([spin, 0.3 * spin, 20.0])
     world.throw([0.1, -0.3, BALL_RADIUS + 0.012 * down], velocity, omega)
-    before = velocity
-    while not world.touches:
-        before = world.ball_velocity
-        world.advance(STILL, 0.0005)
-    while world._touching:
-        world.advance(STILL, 0.0005)
+    before = impact(world)
     expected, turned = ball_flight.bounce(
         before, omega, UP, 0.93, lambda v, s: min(0.25 * 1.93 * v / s, 0.4) if s > 1e-9 else 0.0
     )
@@ -117,12 +123,7 @@ def test_impact_on_the_resting_paddle(world, speed, tolerance, across):
     side = np.cross(normal, [1.0, 0.0, 0.0])
     velocity, spin = -speed * normal + across * side, np.array([30.0, 0.0, 0.0])
     world.throw(centre + 0.08 * normal - across / speed * 0.054 * side, velocity, spin)
-    before = velocity
-    while not world.touches:
-        before = world.ball_velocity
-        world.advance(STILL, 0.0005)
-    while world._touching:
-        world.advance(STILL, 0.0005)
+    before = impact(world)
     assert world.touches[0][1] == "rig_paddle"
     e = ball_flight.RUBBER_E - ball_flight.RUBBER_SLOPE * abs(before @ normal)
     expected, turned = ball_flight.bounce(before, spin, normal, e, lambda v, s: ball_flight.RUBBER_GAIN)
@@ -154,14 +155,8 @@ def test_a_moving_paddle_adds_its_speed(world):
     centre, normal = blade(world)
     moving = np.array([0.0, world.qvel[1], 0.0])
     world.throw(centre + 0.08 * normal + moving * 0.01, -4.0 * normal + moving)
-    before = world.ball_velocity
-    while not world.touches:
-        before = world.ball_velocity
-        world.advance(setpoint, 0.0005)
-    while world._touching:
-        world.advance(setpoint, 0.0005)
-    e = 0.81
-    expected, _ = ball_flight.bounce(before - moving, np.zeros(3), normal, e, lambda v, s: ball_flight.RUBBER_GAIN)
+    before = impact(world, setpoint)
+    expected, _ = ball_flight.bounce(before - moving, np.zeros(3), normal, 0.81, lambda v, s: ball_flight.RUBBER_GAIN)
     np.testing.assert_allclose(world.ball_velocity - moving, expected, atol=0.12)
 
 
@@ -253,7 +248,8 @@ def test_thrower_waits_for_robot_and_ball(world):
     thrower, thrown = Thrower(throws, pause=0.1, first=1), []
     for i in range(300):
         world.advance(STILL, 0.004)
-        if thrower.update(world, world.time):
+        thrower.update(world, world.time)
+        if thrower.thrown > len(thrown):
             thrown.append((i, world.ball))
             np.testing.assert_array_equal(world.ball_velocity, world.ball)
         if i == 100:

@@ -9,8 +9,7 @@ from robot_io.control.bridge import BridgeState
 from robot_io.control.commissioning.homing import SLIP, prepare
 from robot_io.control.interfaces import BridgeConfig
 from robot_io.devices.egm.messages import encode_robot
-from robot_io.devices.festo import AxesThread
-from robot_io.emulator.axes import DriveParams
+from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.config import RigParams
 from robot_io.errors import RefusedError
 from robot_io.safety.faults import Cause
@@ -31,7 +30,7 @@ def standing(**options):
 
 def prepared(rig):
     """The operator's request, as the control process carries it out."""
-    prepare(AxesThread(rig.axes), lambda: rig.bridge.check_homing(rig.now))
+    prepare(rig.axes, lambda: rig.bridge.check_homing(rig.now))
 
 
 def homing():

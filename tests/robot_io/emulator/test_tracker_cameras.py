@@ -11,8 +11,7 @@ from experiments.config import robot as robots
 from experiments.errors import ConfigError
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.config import RigParams
-from robot_io.emulator.tracker import TrackerEmulator, TrackerParams
-from robot_io.emulator.tracker.cameras import CameraPair, CameraParams
+from robot_io.emulator.tracker import CameraPair, CameraParams, TrackerEmulator, TrackerParams
 from tests.support.lockstep_play import lockstep
 
 PAIR = CameraParams(triangulated=True)

@@ -13,6 +13,7 @@ import numpy as np
 from ballmodel.io.ranges import Within
 
 if TYPE_CHECKING:
+    from robot_io.emulator.arm import ArmController
     from robot_io.emulator.axes import AxisEmulator
 
 Metres = Annotated[float, Within(-5.0, 5.0, "m")]
@@ -68,17 +69,17 @@ class HiddenErrors:
     def counted(self, angles: np.ndarray) -> np.ndarray:
         """Angles (n,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
         angles = angles - np.array(self.joint_zeros) if any(self.joint_zeros) else angles
-        return self.ordered(angles)
+        return angles[list(self.joint_order)] if self.joint_order else angles
 
-    def ordered(self, values: np.ndarray) -> np.ndarray:
-        """Values (n,) of the arm's joints in the controller's order."""
-        return values[list(self.joint_order)] if self.joint_order else values
+    def drive_arm(
+        self, arm: ArmController, now: float, position: np.ndarray, velocity: np.ndarray
+    ) -> tuple[np.ndarray, bytes | None]:
+        """One cycle of the arm's controller at the joints' (n,) [rad], [rad/s]; their new velocities, its datagram."""
+        order = list(self.joint_order or range(len(position)))
+        commanded, datagram = arm.step(now, self.counted(position), velocity[order])
+        return commanded[np.argsort(order)], datagram
 
-    def to_joints(self, values: np.ndarray) -> np.ndarray:
-        """Values (n,) in the controller's order, in that of the arm's joints."""
-        return values[np.argsort(self.joint_order)] if self.joint_order else values
-
-    def drive(self, axis: int, emulator: AxisEmulator, now: float, position: float, velocity: float) -> float:
+    def drive_axis(self, axis: int, emulator: AxisEmulator, now: float, position: float, velocity: float) -> float:
         """One step of a linear axis's drive at its carriage's position [m] and velocity [m/s]; its new velocity."""
         factor, zero = (values[min(axis, 1)] for values in (self.axis_factor, self.axis_zero))
         return emulator.step(now, factor * position + zero, factor * velocity) / factor
