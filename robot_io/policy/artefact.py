@@ -18,8 +18,8 @@ import numpy as np
 from robot_io import contract
 from robot_io.contract import Contract
 from robot_io.errors import ContractError
-from robot_io.policy.backends import LoopPolicy, make_policy
-from robot_io.policy.policy import ExportedNetwork, Policy
+from robot_io.policy.backends import make_policy
+from robot_io.policy.policy import ExportedNetwork, LoopPolicy, Policy
 
 SCHEMA_VERSION = 1
 NORMALISER_FORMULA = "(observation - mean) * inverse_scale"
@@ -39,16 +39,8 @@ USER_DEFINED_FILES = (MANIFEST, MANIFEST_DIGEST, *USER_DEFINED_HASHED_FILES)
 USER_DEFINED_TOLERANCE = 1e-5  # of the exported step in float32 on another machine
 
 USER_DEFINED_ARCHITECTURE = ("network", "parameters", "n_parameters", "step")  # of a user-defined network
-MANIFEST_KEYS = (
-    "schema_version",
-    "contract",
-    "architecture",
-    "normaliser",
-    "golden",
-    "files",
-    "provenance",
-    "written_with",
-)
+MANIFEST_KEYS = {"schema_version", "contract", "architecture", "normaliser", "golden", "files", "provenance"}
+MANIFEST_KEYS |= {"written_with"}
 
 _REEXPORT = "export the policy again with this version of the program"
 _RECOPY = "copy the artefact again from where it was exported"
@@ -97,9 +89,7 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
     folder = Path(folder)
     contents = _read_files(folder)
     manifest = _verified_manifest(folder, contents)
-    for name in contents:
-        if name in (MANIFEST, MANIFEST_DIGEST):
-            continue
+    for name in set(contents) - {MANIFEST, MANIFEST_DIGEST}:
         found, expected = sha256(contents[name]), manifest["files"].get(name)
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
@@ -114,14 +104,12 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
         source = contents[NETWORK].decode()
         network = ExportedNetwork(described["network"], tuple(shapes.items()), contents[JAX_EXPORT], source)
         wanted = {"observation": ((count, seen), "float32"), "action": ((count, answered), "float64")}
-    parameters = _arrays(
-        folder / PARAMETERS, contents[PARAMETERS], {name: (shape, "float32") for name, shape in shapes.items()}
-    )
-    golden_input, golden_action = _arrays(folder / GOLDEN, contents[GOLDEN], wanted).values()
-    theta = np.concatenate([parameter.ravel() for parameter in parameters.values()])
+    parameters = _arrays(folder, PARAMETERS, contents, {name: (shape, "float32") for name, shape in shapes.items()})
+    golden_input, golden_action = _arrays(folder, GOLDEN, contents, wanted)
+    theta = np.concatenate([parameter.ravel() for parameter in parameters])
     policy = Policy(theta, *_normaliser(folder / MANIFEST, manifest["normaliser"], seen), network)
     try:
-        action = policy.apply(golden_input) if network is None else _play(policy, golden_input)
+        action = answer(policy, golden_input, robot)
     except Exception as error:  # JAX absent, or of a version that reads the export no more
         if network is None:
             raise
@@ -141,15 +129,16 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
 load_artefact = load  # its name in ``robot_io``
 
 
+def answer(policy: Policy, golden_input: np.ndarray, robot: Contract) -> np.ndarray:
+    """The reference's actions, as ``Artefact`` has them, by the form of the policy that the robot runs."""
+    if policy.network is None:
+        return policy.apply(golden_input)
+    return make_policy("jit", policy, robot).episode(golden_input)
+
+
 def tolerance(network: ExportedNetwork | None) -> float:
     """Largest difference allowed between a policy's answers and its golden outputs."""
     return GOLDEN_TOLERANCE if network is None else USER_DEFINED_TOLERANCE
-
-
-def _play(policy: Policy, observations: np.ndarray) -> np.ndarray:
-    from robot_io.policy.jax_policy import ExportedPolicy  # imports JAX
-
-    return ExportedPolicy(policy).episode(observations)
 
 
 def sha256(content: bytes) -> str:
@@ -237,7 +226,7 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if version != SCHEMA_VERSION:
         raise ArtefactError(f"{path}: schema_version: found {version!r}, expected {SCHEMA_VERSION}; {_REEXPORT}")
-    if set(manifest) != set(MANIFEST_KEYS):
+    if set(manifest) != MANIFEST_KEYS:
         raise ArtefactError(f"{path}: keys are {sorted(manifest)}, expected {sorted(MANIFEST_KEYS)}; {_REEXPORT}")
     for key in ("normaliser", "golden", "files"):
         if not isinstance(manifest[key], dict):
@@ -261,10 +250,14 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     return manifest
 
 
-def _arrays(path: Path, content: bytes, expected: dict[str, tuple[tuple[int, ...], str]]) -> dict[str, np.ndarray]:
+def _arrays(
+    folder: Path, file: str, contents: dict[str, bytes], expected: dict[str, tuple[tuple[int, ...], str]]
+) -> list[np.ndarray]:
+    """A file's arrays in the order of ``expected``, which has their shapes and types."""
+    path = folder / file
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        with np.load(io.BytesIO(contents[file]), allow_pickle=False) as archive:
+            arrays = dict(archive)
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise ArtefactError(f"{path}: not a NumPy archive ({error}); {_REEXPORT}") from error
     if set(arrays) != set(expected):
@@ -275,15 +268,14 @@ def _arrays(path: Path, content: bytes, expected: dict[str, tuple[tuple[int, ...
             raise ArtefactError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} {shape}; {_REEXPORT}")
         if not np.all(np.isfinite(array)):
             raise ArtefactError(f"{path}: {name} has a non-finite number; export an earlier checkpoint")
-    return {name: arrays[name] for name in expected}
+    return [arrays[name] for name in expected]
 
 
 def _normaliser(path: Path, normaliser: dict[str, Any], size: int) -> tuple[np.ndarray, np.ndarray]:
     formula = normaliser.get("formula")
     if formula != NORMALISER_FORMULA:
-        raise ArtefactError(
-            f"{path}: normaliser.formula: found {formula!r}, expected {NORMALISER_FORMULA!r}; {_REEXPORT}"
-        )
+        message = f"normaliser.formula: found {formula!r}, expected {NORMALISER_FORMULA!r}"
+        raise ArtefactError(f"{path}: {message}; {_REEXPORT}")
     arrays = []
     for key in ("mean", "inverse_scale"):
         found = normaliser.get(key)

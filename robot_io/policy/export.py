@@ -28,8 +28,8 @@ from robot_io import contract
 from robot_io.policy import artefact as artefacts
 from robot_io.policy import jax_policy
 from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.backends import make_policy
 from robot_io.policy.jax_policy import Policy
-from robot_io.policy.policy import forward
 
 AGREEMENT = 1e-5  # largest difference allowed between any two forms of the policy, of an action in [-1, 1]
 GOLDEN_COUNT = 64
@@ -90,58 +90,40 @@ def write(
     return report
 
 
-def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str, Any]:
-    """Loads an artefact and compares its four forms on random observation histories.
+def verify(folder: str | Path, seed: int = 0) -> dict[str, Any]:
+    """Loads an artefact and compares its four forms on 1,000 random observation histories.
 
-    Returns {"digest", "histories", "tolerance", "largest_difference" (between any two forms), "from_reference" (per
-    form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
+    Returns {"digest", "largest_difference" (between any two forms), "from_reference" (per form against the NumPy
+    reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
     """
     artefact = artefacts.load(folder)
     policy = artefact.policy
-    history = random_histories(policy, histories, seed)
+    history = random_histories(policy, 1000, seed)
     if policy.network is None:
-        session = onnxruntime.InferenceSession(
-            (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
-        )
-        exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
+        model, exported = ((artefact.folder / name).read_bytes() for name in (artefacts.ONNX, artefacts.JAX_EXPORT))
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
         reference, allowed = policy.apply(history), AGREEMENT
         with jax.default_device(jax.devices("cpu")[0]):
             actions = {
-                "jit": np.asarray(_jitted_forward(policy.astype(np.float32), history)),
+                "jit": np.asarray(jax_policy.jitted_forward(policy.astype(np.float32), history)),
                 "onnxruntime": session.run(["action"], {"history": history})[0],
-                "jax_export": np.asarray(exported.call(history)),
+                "jax_export": np.asarray(jax.export.deserialize(bytearray(exported)).call(history)),
             }
     else:
         # Its other form, the user's Python, is not run here: golden.npz is what that wrote. The exported step must
         # remember nothing of an episode before.
-        runner, episode = jax_policy.ExportedPolicy(policy), history[0].T
+        runner, episode = make_policy("jit", policy, artefact.contract), history[0].T
         reference, allowed = runner.episode(episode), 0.0
         actions = {"jax_export": runner.episode(episode)}
-    stacked = np.stack([reference, *actions.values()])
     from_reference = {name: float(np.max(np.abs(action - reference))) for name, action in actions.items()}
-    largest = float(np.max(stacked.max(axis=0) - stacked.min(axis=0)))
+    largest = float(np.max(np.ptp([reference, *actions.values()], axis=0)))
     if not largest <= allowed:
         raise ArtefactError(
             f"{folder}: its forms of the policy, or its answers to the same episode played twice, differ by "
             f"{largest:.3g} (from the reference: {from_reference}), allowed is {allowed:g}; do not run it, export the "
             "policy again"
         )
-    return {
-        "digest": artefact.digest,
-        "histories": histories,
-        "tolerance": AGREEMENT if policy.network is None else artefacts.USER_DEFINED_TOLERANCE,
-        "largest_difference": largest,
-        "from_reference": from_reference,
-    }
-
-
-def _forward(policy: Policy, history: jax.Array) -> jax.Array:
-    """Histories (8, 11, B) to actions (8, B), not in an accelerator's short format."""
-    with jax.default_matmul_precision("highest"):
-        return forward(policy, history, xp=jnp)
-
-
-_jitted_forward = jax.jit(_forward)
+    return {"digest": artefact.digest, "largest_difference": largest, "from_reference": from_reference}
 
 
 def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
@@ -217,7 +199,7 @@ def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onn
 def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export``, any batch size."""
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
-    return jax_policy.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
+    return jax_policy.serialised(partial(jax_policy.exact_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
 def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:
@@ -234,10 +216,13 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: con
         architecture = artefacts.architecture(robot)
     else:
         network, episode = policy.network, np.ascontiguousarray(history[0].T)
-        action = jax_policy.reference(given, policy, episode).astype(np.float64)
+        if given is network:  # all that is left of a network after fine-tuning
+            action = artefacts.answer(policy, episode, robot)
+        else:
+            action = jax_policy.reference(given, policy, episode)
         contents = {
-            artefacts.PARAMETERS: _npz(network.unflatten(policy.theta)),
-            artefacts.GOLDEN: _npz({"observation": episode, "action": action}),
+            artefacts.PARAMETERS: _npz(policy.parameters),
+            artefacts.GOLDEN: _npz({"observation": episode, "action": action.astype(np.float64)}),
             artefacts.NETWORK: network.source.encode(),
             artefacts.JAX_EXPORT: network.exported,
         }

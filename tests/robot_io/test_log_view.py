@@ -47,7 +47,7 @@ def published_class(schema: bytes, name: str):
 @pytest.fixture(scope="module")
 def messages(tmp_path_factory):
     """(schema, log time, message) of each topic of a session; Foxglove's read with its SDK's schemas."""
-    with log.FileRecorder.start(tmp_path_factory.mktemp("view"), "session", {}) as recorder:
+    with log.FileRecorder(tmp_path_factory.mktemp("view"), "session", {}) as recorder:
         for i, pose in enumerate(POSES):
             recorder.put(log.Joints(0.1 * i, pose, np.zeros(8), 0.1 * i + 0.002))
             recorder.put(log.Joints(0.1 * i + 0.004, pose, np.zeros(8)))  # sooner than a frame is due
@@ -166,7 +166,7 @@ def test_a_calibrated_robot_is_drawn_where_the_gate_has_it():
 def test_the_log_of_a_calibrated_robot_draws_it_there(tmp_path):
     places = []
     for name, metadata in (("as_made", {}), ("calibrated", {"robot_base": [[0.02, -0.03, 0.01], [0.0, 0.0, 0.0]]})):
-        with log.FileRecorder.start(tmp_path, name, metadata) as recorder:
+        with log.FileRecorder(tmp_path, name, metadata) as recorder:
             recorder.put(log.Joints(0.0, POSES[0], np.zeros(8)))
         with open(recorder.close(), "rb") as file:
             (_, _, message), *_ = make_reader(file).iter_messages(topics=["/tf"])
