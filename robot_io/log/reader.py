@@ -19,14 +19,7 @@ from robot_io.log.scan import Fault, Scan
 from robot_io.log.topics import EVENT, HEAD, NANO, Messages, NumbersTopic, topics
 from robot_io.log.writer import FORMAT, FORMAT_VERSION, parts, robot_of
 
-SERIES = {
-    "ball": Ball,
-    "joints": Joints,
-    "commands": Command,
-    "observations": Observation,
-    "actions": Action,
-    "ticks": Tick,
-}
+SERIES = dict(ball=Ball, joints=Joints, commands=Command, observations=Observation, actions=Action, ticks=Tick)
 PIECE = 200_000  # messages of one piece of ``stream``: some five minutes
 
 

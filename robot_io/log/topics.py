@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -32,7 +32,7 @@ HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<i8"), (
 TICK_BYTES = [1, 1, *(1 << bits for bits in range(7, 32, 7))]  # ticks from which the field ``tick`` has a byte more
 
 
-def _define_messages() -> dict[str, Any]:
+def _define_messages() -> tuple[Any, Any]:
     """robot_log.Values and robot_log.Tick, in a pool of their own so that nothing else's names can clash."""
     kind = descriptor_pb2.FieldDescriptorProto
     name, stamp = "robot_log.proto", timestamp_pb2.DESCRIPTOR
@@ -47,10 +47,11 @@ def _define_messages() -> dict[str, Any]:
     pool = descriptor_pool.DescriptorPool()
     for serialized in (stamp.serialized_pb, file.SerializeToString()):
         pool.AddSerializedFile(serialized)
-    return message_factory.GetMessageClassesForFiles([name], pool)
+    classes = message_factory.GetMessageClassesForFiles([name], pool)
+    return classes["robot_log.Values"], classes["robot_log.Tick"]
 
 
-OWN = _define_messages()
+Values, TickMessage = _define_messages()
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Topic:
 
     name: str
     message: Any
-    metadata: dict[str, str] = field(default_factory=dict)
+    metadata: dict[str, str]
 
     def schema(self) -> bytes:
         """The message's FileDescriptorSet, dependencies first, as MCAP wants protobuf schemas."""
@@ -96,7 +97,7 @@ class Messages(NamedTuple):
         return self.data[self.start[i] : self.end[i]].tobytes()
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class NumbersTopic(Topic):
     """A topic with numbers of one kind of record.
 
@@ -166,12 +167,13 @@ class NumbersTopic(Topic):
         return np.frombuffer(content, np.uint8), starts[:, None] + np.arange(8)
 
 
-EVENT = Topic("/event", Log)
+EVENT = Topic("/event", Log, {})
 
 
 def topics(robot: Contract = PAPER) -> dict[str, Topic]:
     """The topics of a robot's log, by name."""
-    joints, units, n = robot.joints, robot.units, robot.n_joints
+    joints, units = robot.joints, robot.units
+    moved = {"position": " ".join(units), "velocity": " ".join(f"{unit}/s" for unit in units)}
 
     def of_joints(name: str, record: type[Numbers], sequence: str = "tick", **fields: str) -> Topic:
         def write(*parts: list[float]) -> Any:
@@ -186,17 +188,8 @@ def topics(robot: Contract = PAPER) -> dict[str, Topic]:
                 raise ValueError(f"joints are {found}, expected {joints}")
             return [getattr(joint, key) for key in fields for joint in message.joints]
 
-        return NumbersTopic(
-            name,
-            JointStates,
-            {"position": " ".join(units), "velocity": " ".join(f"{unit}/s" for unit in units)},
-            record=record,
-            fields=tuple(fields.values()),
-            width=n,
-            write=write,
-            read=read,
-            sequence=sequence,
-        )
+        kept, width = tuple(fields.values()), len(joints)
+        return NumbersTopic(name, JointStates, moved, record, kept, width, write, read, sequence=sequence)
 
     def of_values(name: str, record: type[Numbers], names: tuple[str, ...], units: tuple[str, ...]) -> Topic:
         def read(message: Any) -> list[float]:
@@ -204,52 +197,40 @@ def topics(robot: Contract = PAPER) -> dict[str, Topic]:
                 raise ValueError(f"{len(message.values)} values, expected {len(names)}")
             return list(message.values)
 
+        described = {"names": " ".join(names), "units": " ".join(units)}
         return NumbersTopic(
-            name,
-            values := OWN["robot_log.Values"],
-            {"names": " ".join(names), "units": " ".join(units)},
-            record=record,
-            fields=("values",),
-            width=len(names),
-            write=lambda numbers: values(values=numbers),
-            read=read,
+            name, Values, described, record, ("values",), len(names), lambda numbers: Values(values=numbers), read
         )
 
+    def write_ball(xyz: list[float]) -> Any:
+        return Point3InFrame(frame_id=FRAME, point=Point3(**dict(zip("xyz", xyz, strict=True))))
+
+    def read_ball(message: Any) -> list[float]:
+        return [message.point.x, message.point.y, message.point.z]
+
+    def write_tick(*timings: float) -> Any:
+        return TickMessage(**dict(zip(TIMINGS, timings, strict=True)))
+
+    def read_tick(message: Any) -> list[float]:
+        return [getattr(message, name) for name in TIMINGS]
+
+    where = {"frame": FRAME, "unit": "m"}
     found = (
         NumbersTopic(
-            "/ball",
-            Point3InFrame,
-            {"frame": FRAME, "unit": "m"},
-            record=Ball,
-            fields=("position",),
-            width=3,
-            write=lambda xyz: Point3InFrame(frame_id=FRAME, point=Point3(**dict(zip("xyz", xyz, strict=True)))),
-            read=lambda message: [message.point.x, message.point.y, message.point.z],
-            stamp="capture_time",
-            sequence="id",
+            "/ball", Point3InFrame, where, Ball, ("position",), 3, write_ball, read_ball, "capture_time", "id"
         ),
         of_joints("/joint_states", Joints, "", position="position", velocity="velocity"),
         of_joints("/commands/requested", Command, velocity="requested"),
         of_joints("/commands/sent", Command, position="reference", velocity="sent"),
         of_values("/observation", Observation, robot.observation_names, robot.observation_units),
         of_values("/action", Action, joints, ("1",)),
-        NumbersTopic(
-            "/tick",
-            OWN["robot_log.Tick"],
-            {"unit": "s"},
-            record=Tick,
-            fields=TIMINGS,
-            width=1,
-            write=lambda *timings: OWN["robot_log.Tick"](**dict(zip(TIMINGS, timings, strict=True))),
-            read=lambda message: [getattr(message, name) for name in TIMINGS],
-        ),
+        NumbersTopic("/tick", TickMessage, {"unit": "s"}, Tick, TIMINGS, 1, write_tick, read_tick),
         EVENT,
     )
     return {topic.name: topic for topic in found}
 
 
-@dataclass(frozen=True, slots=True)
-class Encoded:
+class Encoded(NamedTuple):
     """A message ready for MCAP; times in seconds of the control process's clock."""
 
     topic: Topic

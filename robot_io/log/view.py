@@ -39,9 +39,9 @@ ORANGE, RED = (1.0, 0.5, 0.0, 1.0), (0.75, 0.1, 0.1, 1.0)
 UNTURNED = Rotation.identity()
 NOTHING = '{"joints": [], "capsules": [], "blade_capsules": []}'  # geometry of a robot that is not drawn
 
-TF = Topic("/tf", FrameTransforms)
-SCENE = Topic("/scene", SceneUpdate)
-STATE = Topic("/state", KeyValuePair)
+TF = Topic("/tf", FrameTransforms, {})
+SCENE = Topic("/scene", SceneUpdate, {})
+STATE = Topic("/state", KeyValuePair, {})
 TOPICS = (TF, SCENE, STATE)
 
 
@@ -74,7 +74,8 @@ class View:
             p, q = np.array(capsule["p0"], float), np.array(capsule["p1"], float)
             if capsule["joint"] == FIXED:
                 p, q = self._base.outward(p), self._base.outward(q)
-                links.setdefault(FIXED, update.entities.add(id=FIXED, frame_id=FRAME))
+                if FIXED not in links:
+                    links[FIXED] = update.entities.add(id=FIXED, frame_id=FRAME)
             link, width = links[capsule["joint"]], 2.0 * capsule["radius"]
             _add_cylinder(link, 0.5 * (p + q), q - p, width, math.dist(p, q), STEEL)
             for end in (p, q):

@@ -65,27 +65,41 @@ def recording(tmp_path_factory):
 
 
 def expect_ticks(session: log.SessionLog, count: int) -> None:
-    """Every number of the first ``count`` ticks is there."""
-    k = np.arange(count)
+    """Every number of the first ``count`` ticks is there; times are rounded to the nanosecond."""
+    k, now = np.arange(count), session.ticks.time
     eight = np.arange(8.0)[:, None] + k
-    np.testing.assert_array_equal(session.commands.tick, k)
-    np.testing.assert_array_equal(session.commands.requested, eight + 0.5)
-    np.testing.assert_array_equal(session.commands.sent, eight + 0.25)
-    np.testing.assert_array_equal(session.commands.reference, eight + 0.125)
-    np.testing.assert_array_equal(session.joints.position, eight)
-    np.testing.assert_array_equal(session.joints.velocity, -eight)
-    np.testing.assert_array_equal(session.observations.values, np.arange(11.0)[:, None] - k)
-    np.testing.assert_array_equal(session.actions.values, np.tile(0.001 * k, (8, 1)))
-    np.testing.assert_array_equal(session.ball.position, [0.1 + 0 * k, 1.2 - 0.01 * k, 0.3 + 0 * k])
-    np.testing.assert_array_equal(session.ball.id, k // 40)
-    np.testing.assert_array_equal(session.ticks.tick, k)
-    np.testing.assert_array_equal(session.ticks.gantry_age, np.full(count, 0.008))
-    # Times are rounded to the nanosecond.
-    now = session.ticks.time
-    np.testing.assert_allclose(session.ball.capture_time, now - 0.020, rtol=0, atol=3e-9)
-    np.testing.assert_allclose(session.ball.received, now - 0.001, rtol=0, atol=3e-9)
-    np.testing.assert_allclose(session.joints.time, now - 0.004, rtol=0, atol=3e-9)
-    np.testing.assert_allclose(session.joints.received, now - 0.002, rtol=0, atol=3e-9)
+    for found, expected in (
+        (session.commands.tick, k),
+        (session.commands.requested, eight + 0.5),
+        (session.commands.sent, eight + 0.25),
+        (session.commands.reference, eight + 0.125),
+        (session.joints.position, eight),
+        (session.joints.velocity, -eight),
+        (session.observations.values, np.arange(11.0)[:, None] - k),
+        (session.actions.values, np.tile(0.001 * k, (8, 1))),
+        (session.ball.position, [0.1 + 0 * k, 1.2 - 0.01 * k, 0.3 + 0 * k]),
+        (session.ball.id, k // 40),
+        (session.ticks.tick, k),
+        (session.ticks.gantry_age, np.full(count, 0.008)),
+    ):
+        np.testing.assert_array_equal(found, expected)
+    times = session.ball.capture_time, session.ball.received, session.joints.time, session.joints.received
+    wanted = now - np.array([[0.020], [0.001], [0.004], [0.002]])
+    np.testing.assert_allclose(times, wanted, rtol=0, atol=3e-9)
+
+
+def chunks_of(path: Path) -> list:
+    """Where the file's chunks are, by the mcap library."""
+    with open(path, "rb") as file:
+        return make_reader(file).get_summary().chunk_indexes
+
+
+def flip(path: Path, offset: int, bits: int, to: Path) -> Path:
+    """A copy with some bits of one byte flipped."""
+    flipped = bytearray(path.read_bytes())
+    flipped[offset] ^= bits
+    to.write_bytes(flipped)
+    return to
 
 
 # --- records
@@ -282,12 +296,7 @@ def test_a_long_session_goes_on_in_more_files(recording, tmp_path):
 
 
 def test_a_stream_ends_where_the_file_is_damaged(recording, tmp_path):
-    with open(recording, "rb") as file:
-        lost = make_reader(file).get_summary().chunk_indexes[3]
-    flipped = bytearray(recording.read_bytes())
-    flipped[lost.chunk_start_offset + 9 + 100] ^= 4
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(flipped)
+    damaged = flip(recording, chunks_of(recording)[3].chunk_start_offset + 9 + 100, 4, tmp_path / "damaged.mcap")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "BATCH", 1)
         pieces = log.stream(damaged, most=1)
@@ -486,30 +495,20 @@ def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_kept(tmp_path):
 
 
 def test_any_flipped_bit_is_found(recording, tmp_path):
-    whole = recording.read_bytes()
-    damaged = tmp_path / "damaged.mcap"
+    size = recording.stat().st_size
     rng = np.random.default_rng(0)
-    offsets = [*range(60), *range(len(whole) - 60, len(whole)), *rng.integers(60, len(whole) - 60, 300)]
-    for offset in offsets:
-        flipped = bytearray(whole)
-        flipped[offset] ^= 1 << rng.integers(8)
-        damaged.write_bytes(flipped)
-        overview = log.check(damaged)
-        assert overview.faults, f"byte {offset}"
+    for offset in [*range(60), *range(size - 60, size), *rng.integers(60, size - 60, 300).tolist()]:
+        overview = log.check(flip(recording, offset, 1 << rng.integers(8), tmp_path / "damaged.mcap"))
         assert any(fault.start <= offset <= fault.end for fault in overview.faults), (offset, overview.faults)
 
 
 def test_damage_in_one_chunk_costs_that_chunk_only(recording, tmp_path):
-    with open(recording, "rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
+    chunks = chunks_of(recording)
     assert len(chunks) > 4
     for lost in (chunks[0], chunks[2]):
-        flipped = bytearray(recording.read_bytes())
-        flipped[lost.chunk_start_offset + 9 + 100] ^= 4
-        damaged = tmp_path / f"damaged{lost.chunk_start_offset}.mcap"
-        damaged.write_bytes(flipped)
-        end = lost.chunk_start_offset + lost.chunk_length
-        with pytest.raises(LogError, match=f"bytes {lost.chunk_start_offset} to {end}: chunk . cannot be used"):
+        start = lost.chunk_start_offset
+        damaged = flip(recording, start + 9 + 100, 4, tmp_path / f"damaged{start}.mcap")
+        with pytest.raises(LogError, match=f"bytes {start} to {start + lost.chunk_length}: chunk . cannot be used"):
             log.read(damaged)
         session = log.read(damaged, salvage=True)
         assert len(session.faults) == 1
@@ -523,14 +522,9 @@ def test_damage_in_one_chunk_costs_that_chunk_only(recording, tmp_path):
 
 
 def test_a_broken_length_costs_the_way_to_the_next_chunk_only(recording, tmp_path):
-    with open(recording, "rb") as file:
-        lost = make_reader(file).get_summary().chunk_indexes[1]
-    flipped = bytearray(recording.read_bytes())
-    flipped[lost.chunk_start_offset + 3] ^= 1
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(flipped)
-    session = log.read(damaged, salvage=True)
-    assert session.ticks.tick[-1] == 299 and 200 < session.ticks.tick.size < 300
+    damaged = flip(recording, chunks_of(recording)[1].chunk_start_offset + 3, 1, tmp_path / "damaged.mcap")
+    ticks = log.read(damaged, salvage=True).ticks.tick
+    assert ticks[-1] == 299 and 200 < ticks.size < 300
 
 
 def test_cut_files_give_their_complete_chunks(recording, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from importlib import resources
 
 import foxglove.layouts as panels
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import mjx_tt
 from robot_io import log
 from robot_io.calibrated import Frame
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES, LIMITS, PAPER
 from robot_io.log.view import BALL_FRAME, View
 from robot_io.safety.clearance import BLADE, RobotGeometry
 
@@ -173,6 +174,16 @@ def test_the_log_of_a_calibrated_robot_draws_it_there(tmp_path):
         places.append(FrameTransforms.FromString(message.data).transforms[0].translation)
     shift = [getattr(places[1], axis) - getattr(places[0], axis) for axis in "xyz"]
     np.testing.assert_allclose(shift, [0.02, -0.03, 0.01], atol=1e-12)
+
+
+def test_all_that_stands_still_is_one_shape():
+    """Viewers keep one entity of a name."""
+    geometry = json.loads((resources.files("robot_io.safety") / "robot_geometry.json").read_text())
+    first = geometry["capsules"][0]
+    geometry["capsules"] += [first | {"name": name, "joint": "world"} for name in ("post", "foot")]
+    entities = View(robot=replace(PAPER, robot="fixed", geometry=json.dumps(geometry))).scene(0.0).message.entities
+    (world,) = [entity for entity in entities if entity.id == "world"]
+    assert len(world.cylinders) == 2
 
 
 def test_a_view_never_raises_and_skips_what_is_broken():

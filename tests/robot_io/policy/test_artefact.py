@@ -100,12 +100,6 @@ def _forward_by_loops(theta, mean, inverse_scale, history):
     return x[0]
 
 
-def test_parameter_count():
-    assert contract.n_parameters() == 976 == 368 + 408 + 200
-    sizes = [math.prod(shape) for shape in contract.parameter_shapes().values()]
-    assert [sum(sizes[i : i + 2]) for i in (0, 2, 4)] == [368, 408, 200]
-
-
 def test_forward_equals_explicit_loops():
     policy = _policy().astype(np.float64)
     theta, mean, inverse_scale = policy.theta, policy.mean, policy.inv_std
@@ -117,23 +111,6 @@ def test_forward_equals_explicit_loops():
         np.testing.assert_allclose(actions[:, b], expected, atol=1e-13)
         single = policy.apply(histories[:, :, b])
         np.testing.assert_allclose(single, expected, atol=1e-13)
-
-
-@pytest.mark.parametrize(("tap", "seen"), [(1, 7), (0, 0)])
-def test_one_wire_through_the_network_by_hand(tap, seen):
-    # Only ball_z -> filter 5 -> filter 11 -> joint_6 is connected, through one tap: the newer taps see the newest
-    # observation and the older taps the oldest, 1 + 2 + 4 steps back. An idle gate is sigmoid(0) = 1/2.
-    theta = np.zeros(976)
-    parameters = contract.unflatten(theta)  # views
-    parameters["conv1/kernel"][tap, 2, 5] = 1.5
-    parameters["conv2/kernel"][tap, 5, 11] = -2.0
-    parameters["conv3/kernel"][tap, 11, 7] = 3.0
-    history = _histories(1)[:, :, 0]
-    action = Policy(theta, np.full(11, 0.5), np.full(11, 2.0)).apply(history)
-    layer_1 = 0.5 * math.tanh(1.5 * 2.0 * (history[seen, 2] - 0.5))
-    expected = math.tanh(3.0 * 0.5 * math.tanh(-2.0 * layer_1))
-    np.testing.assert_allclose(action, [0, 0, 0, 0, 0, 0, 0, expected], atol=1e-15)
-    assert abs(expected) > 0.05
 
 
 def test_streaming_equals_full_form():
