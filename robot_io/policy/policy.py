@@ -152,11 +152,12 @@ class LoopPolicy:
         Raises ValueError for another shape or a non-finite number, and then remembers nothing of it.
         """
         observation = np.asarray(observation, self.dtype)
-        if observation.shape != (len(self._names),):
-            raise ValueError(f"observation has shape {observation.shape}, wanted {(len(self._names),)}")
+        size = len(self._names)
+        if observation.shape != (size,):
+            raise ValueError(f"observation has shape {observation.shape}, expected {size} finite numbers")
         if not np.isfinite(observation).all():
             bad = [name for name, value in zip(self._names, observation, strict=True) if not np.isfinite(value)]
-            raise ValueError(f"observation has a non-finite {', '.join(bad)}")
+            raise ValueError(f"observation has a non-finite {', '.join(bad)}, expected {size} finite numbers")
         action = self.act(observation, self._first)
         self._first = False
         return action

@@ -134,7 +134,7 @@ def test_streaming_refuses_a_bad_observation_and_forgets_it():
         policy.step(good)
     with pytest.raises(ValueError, match="ball_y"):
         disturbed.step(bad)
-    with pytest.raises(ValueError, match=r"\(10,\).*\(11,\)"):
+    with pytest.raises(ValueError, match=r"\(10,\).* 11 finite"):
         disturbed.step(bad[:10])
     np.testing.assert_array_equal(disturbed.step(-good), undisturbed.step(-good))
 
