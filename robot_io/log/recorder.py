@@ -130,11 +130,6 @@ class Recorder(SessionRecorder):
         os.set_blocking(self._pipe, False)
 
     @property
-    def path(self) -> Path:
-        """Path of the log when it is finished."""
-        return self._session.path
-
-    @property
     def failure(self) -> str | None:
         if not self._broken:
             return None

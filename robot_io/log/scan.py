@@ -305,11 +305,12 @@ def _copy(scan: Scan, writer: Writer) -> int:
 def _read_summary(file: IO[bytes], size: int) -> tuple[int | None, list[McapRecord]]:
     """Where a file's summary starts, and its records; None and no records where it is not sound."""
     file.seek(max(0, size - _FOOTER.size))
-    if len(tail := file.read()) == _FOOTER.size:
-        opcode, _, start, _, crc, magic = _FOOTER.unpack(tail)
+    tail = file.read()
+    if len(tail) == _FOOTER.size and tail[0] == Opcode.FOOTER:
+        _, _, start, _, crc, magic = _FOOTER.unpack(tail)
         file.seek(min(start, size))
         content = file.read()[: -len(magic)]
-        if opcode == Opcode.FOOTER and len(content) > 4 and zlib.crc32(content[:-4]) == crc:
+        if len(content) > 4 and zlib.crc32(content[:-4]) == crc:
             return start, list(StreamReader(BytesIO(content + MCAP0_MAGIC), skip_magic=True).records)
     return None, []
 

@@ -140,39 +140,30 @@ def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onn
     Its metadata say what the numbers are: names, units, the scale of each action and the rate; whole as JSON
     under ``contract``.
     """
-    parameters = policy.parameters
+    parameters, nodes = policy.parameters, []
     constants = {"mean": policy.mean[:, None], "inverse_scale": policy.inv_std[:, None]}
-    nodes = [
-        helper.make_node("Sub", ["history", "mean"], ["centred"]),
-        helper.make_node("Mul", ["centred", "inverse_scale"], ["normalised"]),
-        helper.make_node("Transpose", ["normalised"], ["layer0"], perm=[2, 1, 0]),  # Conv wants (B, channels, time)
-    ]
+
+    def add(kind: str, inputs: str, outputs: str, **attributes: Any) -> None:
+        nodes.append(helper.make_node(kind, inputs.split(), outputs.split(), **attributes))
+
+    add("Sub", "history mean", "centred")
+    add("Mul", "centred inverse_scale", "normalised")
+    add("Transpose", "normalised", "layer0", perm=[2, 1, 0])  # Conv wants (B, channels, time)
     for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED, strict=True), start=1):
         constants[f"kernel{i}"] = np.ascontiguousarray(parameters[f"conv{i}/kernel"].transpose(2, 1, 0))
         constants[f"bias{i}"] = parameters[f"conv{i}/bias"]
-        nodes.append(
-            helper.make_node(
-                "Conv",
-                [f"layer{i - 1}", f"kernel{i}", f"bias{i}"],
-                [f"conv{i}"],
-                kernel_shape=[contract.KERNEL],
-                dilations=[dilation],
-            )
-        )
+        inputs, taps = f"layer{i - 1} kernel{i} bias{i}", [contract.KERNEL]
+        add("Conv", inputs, f"conv{i}", kernel_shape=taps, dilations=[dilation])
         if gated:
-            nodes += [
-                helper.make_node("Split", [f"conv{i}"], [f"signal{i}", f"gate{i}"], axis=1),
-                helper.make_node("Tanh", [f"signal{i}"], [f"tanh{i}"]),
-                helper.make_node("Sigmoid", [f"gate{i}"], [f"sigmoid{i}"]),
-                helper.make_node("Mul", [f"tanh{i}", f"sigmoid{i}"], [f"layer{i}"]),
-            ]
+            add("Split", f"conv{i}", f"signal{i} gate{i}", axis=1)
+            add("Tanh", f"signal{i}", f"tanh{i}")
+            add("Sigmoid", f"gate{i}", f"sigmoid{i}")
+            add("Mul", f"tanh{i} sigmoid{i}", f"layer{i}")
         else:
-            nodes.append(helper.make_node("Tanh", [f"conv{i}"], [f"layer{i}"]))
+            add("Tanh", f"conv{i}", f"layer{i}")
     constants["time_axis"] = np.array([2], np.int64)
-    nodes += [
-        helper.make_node("Squeeze", [f"layer{len(contract.FILTERS)}", "time_axis"], ["batch_first"]),
-        helper.make_node("Transpose", ["batch_first"], ["action"], perm=[1, 0]),
-    ]
+    add("Squeeze", f"layer{len(contract.FILTERS)} time_axis", "batch_first")
+    add("Transpose", "batch_first", "action", perm=[1, 0])
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
         nodes,
