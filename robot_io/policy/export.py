@@ -196,33 +196,29 @@ def jax_export(policy: Policy) -> bytes:
 def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:
     """Files of the artefact by name. given: the user-defined network as it was before its export, or None."""
     history = random_histories(policy, GOLDEN_COUNT, seed=1)
-    if policy.network is None:
-        action = policy.apply(history)
-        contents = {
-            artefacts.PARAMETERS: _npz(policy.parameters),
-            artefacts.GOLDEN: _npz({"history": history, "action": action}),
+    network = policy.network
+    if network is None:
+        golden = {"history": history, "action": policy.apply(history)}
+        forms = {
             artefacts.ONNX: onnx_model(policy, robot).SerializeToString(),
             artefacts.JAX_EXPORT: jax_export(policy),
         }
         architecture = artefacts.architecture(robot)
     else:
-        network, episode = policy.network, np.ascontiguousarray(history[0].T)
+        episode = np.ascontiguousarray(history[0].T)
         if given is network:  # all that is left of a network after fine-tuning
             action = artefacts.answer(policy, episode, robot)
         else:
             action = jax_policy.reference(given, policy, episode)
-        contents = {
-            artefacts.PARAMETERS: _npz(policy.parameters),
-            artefacts.GOLDEN: _npz({"observation": episode, "action": action.astype(np.float64)}),
-            artefacts.NETWORK: network.source.encode(),
-            artefacts.JAX_EXPORT: network.exported,
-        }
+        golden = {"observation": episode, "action": action.astype(np.float64)}
+        forms = {artefacts.NETWORK: network.source.encode(), artefacts.JAX_EXPORT: network.exported}
         architecture = {
             "network": network.name,
             "parameters": {name: list(shape) for name, shape in network.shapes},
             "n_parameters": network.size,
             "step": f"{artefacts.JAX_EXPORT}: theta, mean, inverse_scale, first, state, observation -> action, state",
         }
+    contents = {artefacts.PARAMETERS: _npz(policy.parameters), artefacts.GOLDEN: _npz(golden), **forms}
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
         "contract": contract.describe(robot),
