@@ -87,7 +87,7 @@ def recorded(logs: Logs) -> Logs:
     for tick, (t, u) in enumerate(zip(logs.joints[0].command_time, sent, strict=True)):
         records.append(log.Command(tick, t, u, u, unknown))
     with TemporaryDirectory() as name:
-        with log.FileRecorder.start(Path(name), "session", {}, {}, 0.0, EPOCH) as recorder:
+        with log.FileRecorder(Path(name), "session", {}, {}, 0.0, EPOCH) as recorder:
             recorder.put(*sorted(records, key=lambda record: record.log_time))
         balls, joints = session_logs.load(next(Path(name).glob("*.mcap")))
     return Logs(balls, joints, {})

@@ -97,7 +97,7 @@ class Control:
                     "robot": config.name,
                     "robot_base": [found.base_position, found.base_rotation],
                 }
-                recorder = log.Recorder.start(
+                recorder = log.Recorder(
                     options.log_folder,
                     options.log_name,
                     metadata | dict(options.metadata),

@@ -14,9 +14,10 @@ import signal
 import sys
 import time
 import traceback
+from contextlib import suppress
 
 from robot_io.log.messages import Event, Level, LogError
-from robot_io.log.recorder import FRAME, SETUP
+from robot_io.log.recorder import FRAME
 from robot_io.log.writer import SessionWriter
 
 FLUSH_SECONDS = 0.2
@@ -24,25 +25,17 @@ LOOK_SECONDS = 0.05  # between looks into the pipe, which holds more than five s
 PARTING_SECONDS = 2.0  # that the control process has to end after SIGTERM: a shutdown sends it to both
 
 
-class Frames:
-    """Cuts packed records out of the stream of bytes."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """The records that ``data`` completes."""
-        buffer = self._buffer
-        buffer += data
-        records, start = [], 0
-        while start + FRAME.size <= len(buffer):
-            end = start + FRAME.size + FRAME.unpack_from(buffer, start)[0]
-            if end > len(buffer):
-                break
-            records.append(bytes(buffer[start + FRAME.size : end]))
-            start = end
-        del buffer[:start]
-        return records
+def take_records(buffer: bytearray) -> list[bytes]:
+    """The packed records that are complete in a stream of frames, which leave the buffer."""
+    records, start = [], 0
+    while start + FRAME.size <= len(buffer):
+        end = start + FRAME.size + FRAME.unpack_from(buffer, start)[0]
+        if end > len(buffer):
+            break
+        records.append(bytes(buffer[start + FRAME.size : end]))
+        start = end
+    del buffer[:start]
+    return records
 
 
 def record(stream: int, writer: SessionWriter) -> int:
@@ -51,7 +44,7 @@ def record(stream: int, writer: SessionWriter) -> int:
     leave_at: list[float] = []
     signal.signal(signal.SIGTERM, lambda *_: leave_at.append(time.monotonic() + PARTING_SECONDS))
     os.set_blocking(stream, False)
-    frames, malformed = Frames(), 0
+    buffer, malformed = bytearray(), 0
     next_flush = time.monotonic() + FLUSH_SECONDS
     while True:
         orphaned = os.getppid() != parent  # a child of the control process may hold the pipe open beyond its death
@@ -59,13 +52,13 @@ def record(stream: int, writer: SessionWriter) -> int:
             data = os.read(stream, 1 << 20)
             if not data:
                 return malformed
+            buffer += data
         except BlockingIOError:
             if orphaned:
                 return malformed
             # Looking now and then instead of being woken: a wake-up per record would disturb the control thread.
-            data = b""
             time.sleep(LOOK_SECONDS)
-        for packed in frames.feed(data):
+        for packed in take_records(buffer):
             try:
                 writer.write(packed)
             except LogError as error:
@@ -83,41 +76,22 @@ def record(stream: int, writer: SessionWriter) -> int:
 
 def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _lower_priority()
-    stream = sys.stdin.fileno()
-    try:
-        setup = _read_exactly(stream, SETUP.unpack(_read_exactly(stream, SETUP.size))[0])
-        writer = SessionWriter(pickle.loads(setup))
-        _send_line({"ready": True})
-        malformed = record(stream, writer)
-        _send_line({"path": str(writer.finish(malformed))})
-    except OSError as error:
-        _send_line({"error": str(error)})
-        return 1
-    except Exception as error:
-        traceback.print_exc()
-        _send_line({"error": f"{type(error).__name__}: {error}"})
-        return 1
-    return 0
-
-
-def _lower_priority() -> None:
-    """The control process's priority is not for this one, which shall not preempt it either."""
-    try:
+    with suppress(OSError, AttributeError):  # the control process's priority is not for this one, nor may it preempt it
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         os.nice(5)
-    except (OSError, AttributeError):
-        pass
-
-
-def _read_exactly(stream: int, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        part = os.read(stream, count - len(data))
-        if not part:
-            raise OSError("the control process ended before the log was open")
-        data += part
-    return data
+    try:
+        writer = SessionWriter(pickle.load(sys.stdin.buffer))  # nothing follows it before the answer
+        _send_line({"ready": True})
+        malformed = record(sys.stdin.fileno(), writer)
+        _send_line({"path": str(writer.finish(malformed))})
+        return 0
+    except OSError as error:
+        reason = str(error)
+    except Exception as error:
+        traceback.print_exc()
+        reason = f"{type(error).__name__}: {error}"
+    _send_line({"error": reason})
+    return 1
 
 
 def _send_line(line: dict) -> None:

@@ -18,10 +18,9 @@ import enum
 import json
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
@@ -53,25 +52,26 @@ class Level(enum.IntEnum):
     FATAL = 5
 
 
-class Numbers:
-    """A record whose fields are all numbers.
-
-    LOGGED  the field that says when the control process had the record
-    """
-
+class _Record:
     __slots__ = ()
     KIND: ClassVar[int]
-    LOGGED: ClassVar[str] = "time"
+    LOGGED: ClassVar[str] = "time"  # field that says when the control process had the record, where there is one
 
     @property
     def log_time(self) -> Any:
-        return getattr(self, self.LOGGED)
+        return getattr(self, self.LOGGED, None)
+
+
+class Numbers(_Record):
+    """A record whose fields are all numbers."""
+
+    __slots__ = ()
 
     def pack(self) -> bytes:
         """Raises LogError for arrays of other shapes than the fields have."""
-        layout = _layout(self.KIND)
-        packed, alike = layout.head.pack(self.KIND, *layout.scalars(self)), None
-        for name, length in layout.arrays:
+        head, scalars, arrays = _layout(self.KIND)
+        packed, alike = head.pack(self.KIND, *(getattr(self, name) for name in scalars)), None
+        for name, length in arrays.items():
             values = np.asarray(getattr(self, name), "<f8")
             alike = alike or values.shape
             if len(alike) != 1 or values.shape != ((length,) if length else alike):
@@ -82,34 +82,23 @@ class Numbers:
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
-        layout = _layout(cls.KIND)
-        _, *scalars = layout.head.unpack_from(data)
-        fields: dict[str, Any] = dict(zip(layout.names, scalars, strict=True))
-        size, parts = len(data) - layout.head.size, len(layout.arrays)
-        length = (layout.arrays[0][1] or size // (8 * parts)) if parts else 0
-        if size != 8 * parts * length:
-            raise ValueError(f"expected {layout.head.size + 8 * parts * max(length, 1)} bytes")
-        numbers = np.frombuffer(data, "<f8", offset=layout.head.size) if parts else np.empty(0)
-        for i, (name, _) in enumerate(layout.arrays):
-            fields[name] = numbers[i * length : (i + 1) * length]
-        return cls(**fields)
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    head: struct.Struct
-    names: tuple[str, ...]
-    scalars: Callable[[Any], tuple]
-    arrays: tuple[tuple[str, int], ...]
+        head, scalars, arrays = _layout(cls.KIND)
+        values = dict(zip(scalars, head.unpack_from(data)[1:], strict=True))
+        numbers = np.frombuffer(data, "<f8", offset=head.size)
+        n = numbers.size // max(len(arrays), 1)
+        if numbers.size != sum(length or n for length in arrays.values()):
+            raise ValueError(f"{numbers.size} numbers in the arrays {', '.join(arrays)}")
+        return cls(**values, **{name: numbers[i * n : (i + 1) * n] for i, name in enumerate(arrays)})
 
 
 @cache
-def _layout(kind: int) -> _Layout:
+def _layout(kind: int) -> tuple[struct.Struct, list[str], dict[str, int]]:
+    """The bytes before the arrays, the names of the scalars in them, and the arrays' lengths by name."""
     hints = get_type_hints(_KINDS[kind], include_extras=True)
-    fields = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
-    names = tuple(name for name, form in fields.items() if isinstance(form, str))
-    arrays = tuple((name, form) for name, form in fields.items() if not isinstance(form, str))
-    return _Layout(struct.Struct("<B" + "".join(fields[name] for name in names)), names, attrgetter(*names), arrays)
+    forms = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+    scalars = [name for name, form in forms.items() if isinstance(form, str)]
+    head = struct.Struct("<B" + "".join(forms[name] for name in scalars))
+    return head, scalars, {name: form for name, form in forms.items() if name not in scalars}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,7 +111,6 @@ class Ball(Numbers):
     id            number of the ball in play, as the tracker counts
     """
 
-    KIND: ClassVar[int] = 1
     LOGGED: ClassVar[str] = "received"
     capture_time: Float
     received: Float
@@ -140,7 +128,6 @@ class Joints(Numbers):
     received  [s] when it reached the control process; ``time`` if left out
     """
 
-    KIND: ClassVar[int] = 2
     LOGGED: ClassVar[str] = "received"
     time: Float
     position: Vector
@@ -161,7 +148,6 @@ class Command(Numbers):
     reference  (n,) commanded joint position at ``time``, from which ``sent`` goes on [m], [rad]
     """
 
-    KIND: ClassVar[int] = 3
     tick: Count
     time: Float
     requested: Vector
@@ -173,7 +159,6 @@ class Command(Numbers):
 class Observation(Numbers):
     """The newest observation, ``values`` (3 + n,), that the policy was given in a control tick; SI, not normalised."""
 
-    KIND: ClassVar[int] = 4
     tick: Count
     time: Float
     values: Vector
@@ -183,7 +168,6 @@ class Observation(Numbers):
 class Action(Numbers):
     """The policy's answer, ``values`` (n,), in one control tick, in [-1, 1]."""
 
-    KIND: ClassVar[int] = 5
     tick: Count
     time: Float
     values: Vector
@@ -201,7 +185,6 @@ class Tick(Numbers):
     arm_age         since the newest state of the arm
     """
 
-    KIND: ClassVar[int] = 6
     tick: Count
     time: Float
     lateness: Float
@@ -215,32 +198,22 @@ class Tick(Numbers):
 class End(Numbers):
     """The last record of a session that was closed properly: how many records were lost on the way, and why."""
 
-    KIND: ClassVar[int] = 9
     dropped: Count
     malformed: Count
 
-    @property
-    def log_time(self) -> None:
-        return None
-
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class Event(_Record):
     """Something that happened: a change of state, a fault, what the operator did, an episode's ends.
 
     name  short and enumerated, such as "state", "fault", "operator", "episode_start"
     text  for people, or JSON where the name says so; cut at 3,900 bytes
     """
 
-    KIND: ClassVar[int] = 7
     time: float
     level: Level
     name: str
     text: str = ""
-
-    @property
-    def log_time(self) -> float:
-        return self.time
 
     def pack(self) -> bytes:
         name, text = self.name.encode(), self.text.encode()
@@ -258,16 +231,11 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Metadata:
+class Metadata(_Record):
     """Facts that hold from now on, such as a policy that was exchanged; values that are no strings are kept as JSON."""
 
-    KIND: ClassVar[int] = 8
     name: str
     entries: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def log_time(self) -> None:
-        return None
 
     def pack(self) -> bytes:
         data = bytes([self.KIND]) + json.dumps([self.name, as_strings(self.entries)]).encode()
@@ -283,7 +251,9 @@ class Metadata:
 Record = Ball | Joints | Command | Observation | Action | Tick | Event | Metadata | End
 
 _EVENT = struct.Struct("<BdBB")
-_KINDS = {kind.KIND: kind for kind in (Ball, Joints, Command, Observation, Action, Tick, Event, Metadata, End)}
+_KINDS = dict(enumerate(Record.__args__, start=1))
+for _kind, _class in _KINDS.items():
+    _class.KIND = _kind
 
 
 def unpack(data: bytes) -> Record:

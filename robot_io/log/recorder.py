@@ -18,40 +18,45 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, Protocol, Self
+from typing import IO, Any, Self
 
 from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import LARGEST, End, Event, Level, LogError, Record
-from robot_io.log.writer import Session, SessionWriter, sample_clock_offset, session
+from robot_io.log.writer import SessionWriter, sample_clock_offset, session
 
 PIPE_SIZE = 1 << 20  # bytes, what Linux grants without privileges: more than five seconds of a session
 START_TIMEOUT = 30.0  # [s] for the recorder process to import its libraries and open the file
 FRAME = struct.Struct("<H")  # length of the packed record that follows
-SETUP = struct.Struct("<I")  # length of the session description that comes before all frames
 _ATOMIC = LARGEST + FRAME.size
 
 
-class SessionRecorder(Protocol):
-    """Recorder as the bridge uses it. In a ``with`` block it is closed at its end."""
+class SessionRecorder:
+    """Recorder as the bridge uses it; this one keeps nothing. In a ``with`` block it is closed at its end."""
 
     dropped: int = 0  # records lost so far
 
     @property
     def failure(self) -> str | None:
         """Reason why nothing is recorded any more; None while all is well."""
+        return None
 
     def put(self, *records: Record) -> None:
         """Takes records."""
 
     def close(self) -> Path | None:
         """Finishes the log and returns its path."""
+        return None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+NullRecorder = SessionRecorder
 
 
 class _Process(subprocess.Popen[bytes]):
@@ -64,27 +69,14 @@ class _Process(subprocess.Popen[bytes]):
 class Recorder(SessionRecorder):
     """Records a session through a process of its own. Used by one thread, the control thread."""
 
-    def __init__(self, session: Session, process: _Process) -> None:
-        self.malformed = 0
-        self._session = session
-        self._process = process
-        self._pipe = process.stdin.fileno()
-        self._unreported = 0  # dropped since the log was told last
-        self._reason = ""  # why the first malformed record was refused
-        self._malformed_reported = 0
-        self._broken = False
-        self._answer: dict[str, Any] | None = None
-        self._result: Path | None = None
-
-    @classmethod
-    def start(
-        cls,
+    def __init__(
+        self,
         folder: str | Path,
         name: str,
         metadata: Mapping[str, Any],
         attachments: Mapping[str, str | bytes] | None = None,
         robot: Contract = PAPER,
-    ) -> Recorder:
+    ) -> None:
         """Starts the recorder process and returns when its file ``folder/name.mcap.part`` is open.
 
         metadata     facts about the session, such as the artefact's digest and the git state; what is no string is
@@ -95,47 +87,47 @@ class Recorder(SessionRecorder):
         To be called before the control thread takes real-time priority. Raises LogError when the file exists or cannot
         be made, with the reason.
         """
-        made = session(folder, name, metadata, attachments or {}, sample_clock_offset(), time.monotonic(), True, robot)
+        self.malformed = 0
+        self._reported = (0, 0)  # dropped and malformed, of which the log knows
+        self._reason = ""  # why the first malformed record was refused
+        self._broken = False
+        self._answer: dict[str, Any] | None = None  # the recorder process's last words
+        self._result: Path | None = None
+        offset, start_time = sample_clock_offset(), time.monotonic()
+        self._session = session(folder, name, metadata, attachments or {}, offset, start_time, True, robot)
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
-        process = _Process(
+        self._process = _Process(
             [sys.executable, "-m", "robot_io.log"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C in the terminal ends the control process only
             env={**os.environ, "PYTHONPATH": path},
-            bufsize=0,
         )
+        self._pipe = self._process.stdin.fileno()
         try:
-            pipe = process.stdin.fileno()
-            setup = pickle.dumps(made)
-            process.stdin.write(SETUP.pack(len(setup)))
-            for start in range(0, len(setup), 1 << 16):
-                process.stdin.write(setup[start : start + (1 << 16)])
-            answer = _line(process, START_TIMEOUT)
-            if answer is None:
-                raise LogError(f"{made.unfinished}: the recorder process does not start within {START_TIMEOUT:g} s")
-            if "error" in answer:
-                raise LogError(answer["error"])
-            try:
-                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-            except OSError:
-                pass  # the default still holds a third of a second
-            os.set_blocking(pipe, False)
+            self._hand_over()
         except BaseException as error:
-            process.kill()
-            process.wait()
-            process.stdin.close()
-            process.stdout.close()
+            self._process.kill()
+            self._process.wait()
+            self._process.stdout.close()
+            with suppress(BrokenPipeError):
+                self._process.stdin.close()
             if isinstance(error, BrokenPipeError):
-                raise LogError(f"{made.unfinished}: the recorder process ended at once") from error
+                raise LogError(f"{self._session.unfinished}: the recorder process ended at once") from error
             raise
-        return cls(made, process)
 
-    @property
-    def path(self) -> Path:
-        """Path of the log when it is finished."""
-        return self._session.path
+    def _hand_over(self) -> None:
+        pickle.dump(self._session, self._process.stdin)
+        self._process.stdin.flush()
+        answer = self._read_line(START_TIMEOUT)
+        if answer is None:
+            raise LogError(f"{self._session.unfinished}: the recorder process does not start in {START_TIMEOUT:g} s")
+        if "error" in answer:
+            raise LogError(answer["error"])
+        with suppress(OSError):  # the default still holds a third of a second
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+        os.set_blocking(self._pipe, False)
 
     @property
     def failure(self) -> str | None:
@@ -162,14 +154,15 @@ class Recorder(SessionRecorder):
                 packed = record.pack()
                 frame = FRAME.pack(len(packed)) + packed
             except Exception as error:  # whatever is wrong with a record, the robot must go on
-                self._count_malformed(error)
+                self.malformed += 1
+                self._reason = self._reason or f"{type(error).__name__}: {error}"
                 continue
             if size + len(frame) > _ATOMIC:
                 self._send(frames)
                 frames, size = [], 0
             frames.append(frame)
             size += len(frame)
-        if frames and self._send(frames) and (self._unreported or self.malformed > self._malformed_reported):
+        if frames and self._send(frames) and self._reported != (self.dropped, self.malformed):
             self._report(records[-1].log_time)
 
     def close(self, timeout: float = 10.0) -> Path:
@@ -179,9 +172,12 @@ class Recorder(SessionRecorder):
         """
         if self._result is not None:
             return self._result
+        left = self._session.unfinished
         if self._process.stdout.closed:
-            raise LogError(f"{self._session.unfinished}: not finished, and closed before")
-        self._send_end(End(self.dropped, self.malformed), timeout)
+            raise LogError(f"{left}: not finished, and closed before")
+        end, deadline = End(self.dropped, self.malformed).pack(), time.monotonic() + timeout
+        while not self._write(FRAME.pack(len(end)) + end) and not self._broken and time.monotonic() < deadline:
+            time.sleep(0.001)  # until there is room
         self._process.stdin.close()
         answer = self._read_answer(timeout) or {"error": f"the recorder process did not answer in {timeout:g} s"}
         try:
@@ -192,71 +188,58 @@ class Recorder(SessionRecorder):
         self._process.stdout.close()
         self._broken = True
         if "error" in answer:
-            left = self._session.unfinished
             raise LogError(f"{left}: not finished ({answer['error']}); mjx-tt log salvage {left} saves what it holds")
         self._result = Path(answer["path"])
         return self._result
 
     def _send(self, frames: list[bytes]) -> bool:
+        sent = self._write(b"".join(frames))
+        if not sent:
+            self.dropped += len(frames)
+        return sent
+
+    def _write(self, data: bytes) -> bool:
         try:
-            os.write(self._pipe, b"".join(frames))
+            os.write(self._pipe, data)
             return True
         except BlockingIOError:
-            pass
+            return False
         except OSError:
             self._broken = True
-        self.dropped += len(frames)
-        self._unreported += len(frames)
-        return False
+            return False
 
     def _report(self, time: float | None) -> None:
         """Tells the log what it missed, now that there is room again."""
         if time is None:
             return
-        dropped, malformed = self._unreported, self.malformed - self._malformed_reported
+        dropped, malformed = self.dropped - self._reported[0], self.malformed - self._reported[1]
         text = {"dropped": dropped, "malformed": malformed, "total_dropped": self.dropped, "reason": self._reason[:500]}
         packed = Event(time, Level.WARNING, "log_dropped", json.dumps(text)).pack()
-        try:
-            os.write(self._pipe, FRAME.pack(len(packed)) + packed)
-        except OSError:
-            return  # next time
-        self._unreported, self._malformed_reported = 0, self.malformed
+        if self._write(FRAME.pack(len(packed)) + packed):  # else next time
+            self._reported = self.dropped, self.malformed
 
     def _read_answer(self, timeout: float) -> dict[str, Any] | None:
-        """The recorder process's last words, None before it said any."""
-        if self._answer is None:
-            self._answer = _line(self._process, timeout)
+        self._answer = self._answer or self._read_line(timeout)
         return self._answer
 
-    def _count_malformed(self, error: Exception) -> None:
-        self.malformed += 1
-        self._reason = self._reason or f"{type(error).__name__}: {error}"
-
-    def _send_end(self, end: End, timeout: float) -> None:
-        packed = end.pack()
-        poll = select.poll()
-        poll.register(self._pipe, select.POLLOUT)
-        deadline = time.monotonic() + timeout
-        while (left := deadline - time.monotonic()) > 0 and poll.poll(left * 1000):
-            try:
-                os.write(self._pipe, FRAME.pack(len(packed)) + packed)
-                return
-            except BlockingIOError:
-                time.sleep(0.001)  # there is room, but not enough
-            except OSError:
-                return
+    def _read_line(self, timeout: float) -> dict[str, Any] | None:
+        """The next line that the recorder process says, None when it says nothing in time."""
+        line, deadline, stdout = b"", time.monotonic() + timeout, self._process.stdout
+        while not line.endswith(b"\n"):
+            if not select.select([stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                return None
+            part = os.read(stdout.fileno(), 1 << 16)
+            if not part:
+                return {"error": "the recorder process has ended"}
+            line += part
+        return json.loads(line)
 
 
 class FileRecorder(SessionRecorder):
     """The same log written in the calling process: for lock-step runs, where time stands still while it writes."""
 
-    def __init__(self, session: Session) -> None:
-        self._writer = SessionWriter(session)
-        self._result: Path | None = None
-
-    @classmethod
-    def start(
-        cls,
+    def __init__(
+        self,
         folder: str | Path,
         name: str,
         metadata: Mapping[str, Any],
@@ -264,17 +247,15 @@ class FileRecorder(SessionRecorder):
         start_time: float = 0.0,
         clock_offset_ns: int = 0,
         robot: Contract = PAPER,
-    ) -> FileRecorder:
-        """As ``Recorder.start``. Reads no clock and names no host, so that equal runs give equal files.
+    ) -> None:
+        """As ``Recorder``. Reads no clock and names no host, so that equal runs give equal files.
 
         ``start_time`` [s] is the session's start on the scheduler's clock, ``clock_offset_ns`` puts that clock's zero
         somewhere else than at the start of 1970.
         """
-        return cls(session(folder, name, metadata, attachments or {}, clock_offset_ns, start_time, False, robot))
-
-    @property
-    def failure(self) -> None:
-        return None
+        made = session(folder, name, metadata, attachments or {}, clock_offset_ns, start_time, False, robot)
+        self._writer = SessionWriter(made)
+        self._result: Path | None = None
 
     def put(self, *records: Record) -> None:
         """Writes records. Raises LogError for a malformed one, OSError when the disk refuses."""
@@ -287,28 +268,3 @@ class FileRecorder(SessionRecorder):
             self._writer.write(End(0, 0).pack())
             self._result = self._writer.finish()
         return self._result
-
-
-class NullRecorder(SessionRecorder):
-    """Keeps nothing."""
-
-    failure = None
-
-    def put(self, *records: Record) -> None:
-        pass
-
-    def close(self) -> None:
-        return None
-
-
-def _line(process: _Process, timeout: float) -> dict[str, Any] | None:
-    """The next line that the recorder process says, None when it says nothing in time."""
-    line, deadline = b"", time.monotonic() + timeout
-    while not line.endswith(b"\n"):
-        if not select.select([process.stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
-            return None
-        part = os.read(process.stdout.fileno(), 1 << 16)
-        if not part:
-            return {"error": "the recorder process has ended"}
-        line += part
-    return json.loads(line)

@@ -11,42 +11,35 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, Writer
 from zstandard import ZstdError, frame_content_size
 
 from ballmodel.io.atomic_files import replacing
 from robot_io.log.messages import LogError
-from robot_io.log.topics import MARGIN, NANO, Messages
-from robot_io.log.writer import CHUNK_SIZE, SUFFIX, UNFINISHED, checksum
+from robot_io.log.topics import HEAD, MARGIN, NANO, Messages
+from robot_io.log.writer import SUFFIX, UNFINISHED, add_metadata, checksum, start_file
 
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked
 BATCH = 1 << 22  # bytes of messages that are handed out together
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
-_FOOTER = struct.Struct("<BQQQI")  # with its head: starts of summary and its offsets, CRC
-_MESSAGE = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<i8"), ("publish_time", "<i8")])
+_FOOTER = struct.Struct("<BQQQI8s")  # with its head: starts of summary and its offsets, CRC; then the file's magic
 _MALFORMED = (McapError, ZstdError, ValueError, OverflowError, struct.error)
-_READERS: dict[int, Callable[[ReadDataStream], Any]] = {
-    Opcode.HEADER: Header.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.CHUNK: Chunk.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.DATA_END: DataEnd.read,
-}
+# What may stand before the summary; the messages are in chunks.
+_KINDS = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX}
+_KINDS |= {Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,7 @@ class Fault:
         return f"bytes {self.start} to {self.end}: {self.what}"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Overview:
     """Contents of a file, without its numbers.
 
@@ -74,16 +67,16 @@ class Overview:
     """
 
     path: Path
-    metadata: dict[str, dict[str, str]]
-    counts: dict[str, int]
-    first: int | None
-    last: int | None
-    complete: bool
-    faults: tuple[Fault, ...]
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    first: int | None = None
+    last: int | None = None
+    complete: bool = True
+    faults: list[Fault] = field(default_factory=list)
 
     @property
     def messages(self) -> int:
-        return sum(self.counts.values())
+        return self.counts.total()
 
     @property
     def duration(self) -> float:
@@ -98,101 +91,87 @@ class Overview:
         return "damaged" if len(self.faults) > 1 else "interrupted"
 
 
-class Scan:
-    """One walk through a file: iterate to get what is sound of it, then see ``faults``.
+class Scan(Overview):
+    """One walk through a file: iterate to get what is sound of it, in the file's order, then see the attributes.
 
-    Records come in the order of the file. Chunks whose checksum fails are left out; where the walk loses its footing,
-    it goes on at the next chunk that the file's index names, if it has one. ``schemas`` and ``channels`` are by id,
-    those of the messages so far.
+    Chunks whose checksum fails are left out; where the walk loses its footing, it goes on at the next chunk that the
+    file's index names, if it has one. ``schemas`` and ``channels`` are by id, ``attachments`` by name.
     """
 
     def __init__(self, path: str | os.PathLike) -> None:
-        self.path = Path(path)
-        self.faults: list[Fault] = []
+        super().__init__(Path(path))
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.messages = 0
+        self.attachments: dict[str, bytes] = {}
+        self._contents: list[bytes] = []  # of chunks that were not yet handed out
+        self._places = array("q")  # start and end of each message in the contents, one behind the other
         self._size = self.path.stat().st_size
-        self._chunks = 0
-        self._chunk_starts: list[int] | None = None
-        self._contents: list[bytes] = []
-        self._starts, self._ends = array("q"), array("q")  # of messages in the contents, one behind the other
         with open(self.path, "rb") as file:
             file.seek(-min(len(MCAP0_MAGIC), self._size), os.SEEK_END)
             self.complete = file.read() == MCAP0_MAGIC and self._size > len(MCAP0_MAGIC)
+            self._summary_start, summary = _read_summary(file, self._size)
+        # The first chunk declares schemas and channels, which the summary repeats.
+        self._declare(*summary)
+        self._starts = [record.chunk_start_offset for record in summary if isinstance(record, ChunkIndex)]
+        if self._summary_start is not None:
+            self._starts.append(self._summary_start - _HEAD.size - 4)  # the data's end
 
     def __iter__(self) -> Iterator[Messages | Attachment | Metadata]:
         with open(self.path, "rb") as file:
             for record in self._walk(file):
-                if not isinstance(record, Chunk):
-                    yield from self._batch()  # all in the order of the file
-                    yield record
-                elif sum(map(len, self._contents)) >= BATCH:
+                if not isinstance(record, Chunk) or sum(map(len, self._contents)) >= BATCH:
                     yield from self._batch()
+                if isinstance(record, Metadata):
+                    self.metadata[record.name] = record.metadata
+                    yield record
+                elif isinstance(record, Attachment):
+                    self.attachments[record.name] = record.data
+                    yield record
         yield from self._batch()
 
     def _walk(self, file: IO[bytes]) -> Iterator[Chunk | Attachment | Metadata]:
         """Sound records; messages of sound chunks are kept for ``_batch``."""
-        offset = 0
-        crc = zlib.crc32(magic := file.read(len(MCAP0_MAGIC)))
+        magic, chunks = file.read(len(MCAP0_MAGIC)), 0
+        offset, crc = len(magic), zlib.crc32(magic)
         if magic != MCAP0_MAGIC:
-            self._fault(0, len(magic), "no MCAP file, it begins otherwise")
-            if not self._find_chunks(file):
+            self._fault(0, offset, "no MCAP file, it begins otherwise")
+            if not self._starts:
                 return
-        offset = len(magic)
-        while True:
-            head = file.read(_HEAD.size)
-            if len(head) < _HEAD.size:
-                self._fault(offset, self._size, "the file ends here, unfinished")
-                return
-            opcode, length = _HEAD.unpack(head)
-            end = offset + _HEAD.size + length
-            if opcode not in _READERS and opcode != Opcode.MESSAGE_INDEX:
-                wrong = f"no record starts here (kind {opcode:#x})"
-            elif end > self._size:
-                wrong = "the file ends within a record, unfinished or damaged"
-            else:
-                content = file.read(length)
-                record, wrong = _parse(opcode, content)
-            if wrong:
-                following = min((start for start in self._find_chunks(file) if start > offset), default=None)
-                self._fault(offset, following or self._size, wrong)
-                if following is None:
+        while len(head := file.read(_HEAD.size)) == _HEAD.size:
+            end = None
+            try:
+                record, content = _read_record(file, head, self._size - offset)
+                end = offset + len(head) + len(content)
+                if isinstance(record, Chunk):
+                    chunks += 1
+                    self._unpack(record, chunks)
+                _check_record(record, content)
+            except ValueError as error:
+                following = end or min((start for start in self._starts if start > offset), default=self._size)
+                self._fault(offset, following, str(error))
+                if end is None and following == self._size:
                     return
                 file.seek(offset := following)
                 continue
             if isinstance(record, DataEnd):
                 # Where something was found already, this checksum cannot fit and says nothing more.
                 if not self.faults and record.data_section_crc not in (0, crc):
-                    what = (
-                        "the CRC of the whole does not fit: a chunk's head, an index of messages or this CRC is damaged"
-                    )
-                    self._fault(0, end, what)
-                self._check_summary(end, file.read())
+                    damaged = "a chunk's head, an index of messages or this CRC is damaged"
+                    self._fault(0, end, f"the CRC of the whole does not fit: {damaged}")
+                if not self.complete:
+                    self._fault(self._size - len(MCAP0_MAGIC), self._size, "the file does not end with its footer")
+                if self._summary_start != end:
+                    self._fault(end, self._size, "the CRC of the summary does not fit; messages are not affected")
                 return
-            crc = zlib.crc32(content, zlib.crc32(head, crc))
-            if isinstance(record, Chunk):
-                self._chunks += 1
-                wrong = self._unpack(record)
-                wrong = wrong and f"chunk {self._chunks} cannot be used ({wrong})"
-            elif isinstance(record, Attachment) and zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], "little"):
-                wrong = f"attachment {record.name!r}: the CRC does not fit"
-            elif isinstance(record, Metadata):
-                digest = checksum(record.name, record.metadata)
-                if record.metadata.get("checksum", digest) != digest:
-                    wrong = f"metadata {record.name!r}: the SHA-256 does not fit"
-            elif isinstance(record, Schema | Channel):
-                self._declare(record)
-            if wrong:
-                self._fault(offset, end, wrong)
-                self._find_chunks(file)  # the first chunk declares schemas and channels, which the summary repeats
-                file.seek(end)
-            elif isinstance(record, Chunk | Attachment | Metadata):
+            offset, crc = end, zlib.crc32(content, zlib.crc32(head, crc))
+            self._declare(record)
+            if isinstance(record, Chunk | Attachment | Metadata):
                 yield record
-            offset = end
+        self._fault(offset, self._size, "the file ends here, unfinished")
 
-    def _unpack(self, chunk: Chunk) -> str:
-        """Keeps a chunk's messages; what is wrong with it, "" for a sound one."""
+    def _unpack(self, chunk: Chunk, number: int) -> None:
+        """Keeps a chunk's messages. Raises ValueError where it is damaged."""
+        places, at, before = array("q"), 0, sum(map(len, self._contents))
         try:
             # Sizes that a flipped bit has made huge must not reach the decompressor.
             known = frame_content_size(chunk.data) if chunk.compression == "zstd" else -1
@@ -200,65 +179,42 @@ class Scan:
                 raise ValueError(f"sizes do not agree: {known} and {chunk.uncompressed_size} bytes")
             stream, size = get_chunk_data_stream(chunk, validate_crc=True)
             content = stream.read(size)
-            starts, ends, at = array("q"), array("q"), 0
-            before = sum(map(len, self._contents))
             while at < size:
                 opcode, length = _HEAD.unpack_from(content, at)
                 at += _HEAD.size
                 if opcode == Opcode.MESSAGE:
-                    starts.append(before + at)
-                    ends.append(before + at + length)
+                    places.extend((before + at, before + at + length))
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._declare(_READERS[opcode](ReadDataStream(BytesIO(content[at : at + length]))))
+                    kind = Schema if opcode == Opcode.SCHEMA else Channel
+                    self._declare(kind.read(ReadDataStream(BytesIO(content[at : at + length]))))
                 at += length
             if at != size:
                 raise ValueError("its last record ends beyond it")
         except _MALFORMED as error:
-            return str(error)
+            raise ValueError(f"chunk {number} cannot be used ({error})") from None
         self._contents.append(content)
-        self._starts += starts
-        self._ends += ends
-        return ""
+        self._places += places
 
     def _batch(self) -> Iterator[Messages]:
         """The messages that were kept, and forgets them."""
-        if self._starts:
+        if self._places:
             data = np.frombuffer(b"".join([bytes(MARGIN), *self._contents]), np.uint8)
-            start, end = (np.array(places, np.int64) + MARGIN for places in (self._starts, self._ends))
-            heads = np.lib.stride_tricks.sliding_window_view(data, _MESSAGE.itemsize)[start].view(_MESSAGE)[:, 0]
-            self.messages += start.size
-            fields = (np.ascontiguousarray(heads[name]) for name in _MESSAGE.names or ())
-            batch = Messages(data, start + _MESSAGE.itemsize, end, *fields)
-            self._contents, self._starts, self._ends = [], array("q"), array("q")
-            yield batch
+            start, end = np.array(self._places, np.int64).reshape(-1, 2).T + MARGIN
+            heads = np.lib.stride_tricks.sliding_window_view(data, HEAD.itemsize)[start].view(HEAD)[:, 0]
+            for channel, count in zip(*np.unique(heads["channel"], return_counts=True), strict=True):
+                declared = self.channels.get(channel)
+                self.counts[declared.topic if declared else f"channel {channel}"] += int(count)
+            times = [int(heads["log_time"].min()), int(heads["log_time"].max()), self.first, self.last]
+            self.first, self.last = (f(time for time in times if time is not None) for f in (min, max))
+            self._contents, self._places = [], array("q")
+            yield Messages(data, start + HEAD.itemsize, end, heads)
 
-    def _declare(self, record: Schema | Channel) -> None:
-        known: dict = self.schemas if isinstance(record, Schema) else self.channels
-        known.setdefault(record.id, record)
-
-    def _check_summary(self, start: int, rest: bytes) -> None:
-        """``rest``: of the file from the end of its data at ``start``."""
-        if not rest.endswith(MCAP0_MAGIC):
-            self._fault(self._size - len(MCAP0_MAGIC), self._size, "the file does not end with its footer")
-        if not _is_summary(rest, start):
-            self._fault(start, self._size, "the CRC of the summary does not fit; messages are not affected")
-
-    def _find_chunks(self, file: IO[bytes]) -> list[int]:
-        """Where chunks start and the data ends, by a sound summary, whose schemas and channels are declared as well."""
-        if self._chunk_starts is None:
-            self._chunk_starts = []
-            file.seek(max(0, self._size - len(MCAP0_MAGIC) - _FOOTER.size))
-            tail = file.read(_FOOTER.size)
-            start = _FOOTER.unpack(tail)[2] if len(tail) == _FOOTER.size else self._size
-            file.seek(min(start, self._size))
-            if self.complete and _is_summary(summary := file.read(), start):
-                for record in StreamReader(BytesIO(summary), skip_magic=True).records:
-                    if isinstance(record, Schema | Channel):
-                        self._declare(record)
-                    elif isinstance(record, ChunkIndex):
-                        self._chunk_starts.append(record.chunk_start_offset)
-                self._chunk_starts.append(start - _HEAD.size - 4)
-        return self._chunk_starts
+    def _declare(self, *records: McapRecord | None) -> None:
+        for record in records:
+            if isinstance(record, Schema):
+                self.schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                self.channels.setdefault(record.id, record)
 
     def _fault(self, start: int, end: int, what: str) -> None:
         self.faults.append(Fault(start, end, what))
@@ -266,18 +222,10 @@ class Scan:
 
 def check(path: str | os.PathLike) -> Overview:
     """Reads a whole file and checks everything that can be checked. Raises OSError when it cannot be read."""
-    scan, counts, metadata, times = Scan(path), Counter[int](), {}, np.empty(0, np.int64)
-    for part in scan:
-        if isinstance(part, Metadata):
-            metadata[part.name] = part.metadata
-        elif isinstance(part, Messages):
-            counts.update(part.channel.tolist())
-            times = np.append(times, [part.log_time.min(), part.log_time.max()])
-    by_topic: Counter[str] = Counter()
-    for channel, count in counts.items():
-        by_topic[scan.channels[channel].topic if channel in scan.channels else f"channel {channel}"] += count
-    first, last = (int(times.min()), int(times.max())) if times.size else (None, None)
-    return Overview(scan.path, metadata, dict(by_topic), first, last, scan.complete, tuple(scan.faults))
+    scan = Scan(path)
+    for _ in scan:
+        pass
+    return scan
 
 
 def glance(path: str | os.PathLike) -> Overview:
@@ -292,11 +240,10 @@ def glance(path: str | os.PathLike) -> Overview:
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     except _MALFORMED:
         return check(path)
-    statistics = summary.statistics
-    counts = {summary.channels[id].topic: count for id, count in statistics.channel_message_counts.items()}
-    some = statistics.message_count > 0
-    first, last = (statistics.message_start_time, statistics.message_end_time) if some else (None, None)
-    return Overview(path, metadata, counts, first, last, True, ())
+    found = summary.statistics
+    counts = Counter({summary.channels[id].topic: count for id, count in found.channel_message_counts.items()})
+    times = (found.message_start_time, found.message_end_time) if found.message_count else (None, None)
+    return Overview(path, metadata, counts, *times)
 
 
 def salvage(path: str | os.PathLike, out: str | os.PathLike | None = None) -> Overview:
@@ -313,18 +260,18 @@ def salvage(path: str | os.PathLike, out: str | os.PathLike | None = None) -> Ov
         raise LogError(f"{out}: exists; give another name for what is salvaged")
     scan = Scan(path)
     with replacing(out) as temporary, open(temporary, "wb") as stream:
-        writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        writer.start(profile="", library="robot_io.log salvage")
+        writer = start_file(stream, "robot_io.log salvage")
         unknown = _copy(scan, writer)
-        if scan.messages == unknown:
+        messages = scan.messages - unknown
+        if not messages:
             raise LogError(f"{path}: no complete chunk with messages, nothing can be salvaged")
         entries = {
             "source": path.name,
             "faults": "\n".join(map(str, scan.faults)),
-            "messages": str(scan.messages - unknown),
+            "messages": str(messages),
             "messages_of_unknown_topic": str(unknown),
         }
-        writer.add_metadata("salvage", {**entries, "checksum": checksum("salvage", entries)})
+        add_metadata(writer, "salvage", entries)
         writer.finish()
         stream.flush()
         os.fsync(stream.fileno())
@@ -339,17 +286,15 @@ def _copy(scan: Scan, writer: Writer) -> int:
             if id not in schemas:
                 schemas[id] = writer.register_schema(schema.name, schema.encoding, schema.data)
         for id, channel in scan.channels.items():
-            if id not in channels and channel.schema_id in schemas:
-                channels[id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
-                )
+            if id not in channels and (schema_id := schemas.get(channel.schema_id)) is not None:
+                encoding = channel.message_encoding
+                channels[id] = writer.register_channel(channel.topic, encoding, schema_id, channel.metadata)
         if isinstance(part, Attachment):
             writer.add_attachment(part.create_time, part.log_time, part.name, part.media_type, part.data)
         elif isinstance(part, Metadata):
             writer.add_metadata(part.name, part.metadata)
         else:
-            columns = (part.channel, part.log_time, part.publish_time, part.sequence)
-            for i, (id, logged, published, sequence) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+            for i, (id, sequence, logged, published) in enumerate(part.head.tolist()):
                 if id in channels:
                     writer.add_message(channels[id], logged, part.content(i), published, sequence)
                 else:
@@ -357,35 +302,48 @@ def _copy(scan: Scan, writer: Writer) -> int:
     return unknown
 
 
-class _Stream(ReadDataStream):
-    """The library's stream gives less than asked for at its end; this one says so."""
+def _read_summary(file: IO[bytes], size: int) -> tuple[int | None, list[McapRecord]]:
+    """Where a file's summary starts, and its records; None and no records where it is not sound."""
+    file.seek(max(0, size - _FOOTER.size))
+    tail = file.read()
+    if len(tail) == _FOOTER.size and tail[0] == Opcode.FOOTER:
+        _, _, start, _, crc, magic = _FOOTER.unpack(tail)
+        file.seek(min(start, size))
+        content = file.read()[: -len(magic)]
+        if len(content) > 4 and zlib.crc32(content[:-4]) == crc:
+            return start, list(StreamReader(BytesIO(content + MCAP0_MAGIC), skip_magic=True).records)
+    return None, []
 
-    def read(self, length: int) -> bytes:
-        data = super().read(length)
-        if len(data) != length:
-            raise EndOfFile()
-        return data
+
+def _check_record(record: McapRecord | None, content: bytes) -> None:
+    """Raises ValueError for a checksum of the record's own that does not fit."""
+    if isinstance(record, Attachment) and zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], "little"):
+        raise ValueError(f"attachment {record.name!r}: the CRC does not fit")
+    if isinstance(record, Metadata) and record.metadata.get("checksum") not in (None, checksum(record)):
+        raise ValueError(f"metadata {record.name!r}: the SHA-256 does not fit")
 
 
-def _parse(opcode: int, content: bytes) -> tuple[McapRecord | None, str]:
-    """The record, None for an index of messages, and what is wrong with it, "" for nothing."""
+def _read_record(file: IO[bytes], head: bytes, left: int) -> tuple[McapRecord | None, bytes]:
+    """A record, None for an index of messages, and its bytes. Raises ValueError where there is none.
+
+    left  bytes from the record's start to the file's end
+    """
+    opcode, length = _HEAD.unpack(head)
+    if opcode not in _KINDS:
+        raise ValueError(f"no record starts here (kind {opcode:#x})")
+    if len(head) + length > left:
+        raise ValueError("the file ends within a record, unfinished or damaged")
+    content = file.read(length)
     if opcode == Opcode.MESSAGE_INDEX:
-        sound = len(content) >= 6 and len(content) == 6 + int.from_bytes(content[2:6], "little")
-        return None, "" if sound else "a malformed index of messages"
-    stream = _Stream(BytesIO(content))
+        if length < 6 or length != 6 + int.from_bytes(content[2:6], "little"):
+            raise ValueError("a malformed index of messages")
+        return None, content
     try:
-        record = _READERS[opcode](stream)
+        record = next(StreamReader(BytesIO(head + content), skip_magic=True, emit_chunks=True).records)
+        record.write(again := RecordBuilder())
     except _MALFORMED as error:
-        return None, f"a malformed record of kind {opcode:#x} ({type(error).__name__}: {error})"
-    if stream.count != len(content):
-        return None, f"a record of kind {opcode:#x} with {len(content)} bytes, {stream.count} of which make sense"
-    return record, ""
-
-
-def _is_summary(content: bytes, start: int) -> bool:
-    """Whether a file's last bytes, from ``start`` on, are a sound summary and its footer."""
-    footer = content[-len(MCAP0_MAGIC) - _FOOTER.size : -len(MCAP0_MAGIC)]
-    if len(footer) < _FOOTER.size:
-        return False
-    opcode, _, begins, _, crc = _FOOTER.unpack(footer)
-    return opcode == Opcode.FOOTER and begins == start and zlib.crc32(content[: -len(MCAP0_MAGIC) - 4]) == crc
+        raise ValueError(f"a malformed record of kind {opcode:#x} ({type(error).__name__}: {error})") from None
+    # The library takes a record whose lengths do not agree. The last bytes may be a CRC that is made anew.
+    if again.end()[:-4] != (head + content)[:-4]:
+        raise ValueError(f"a record of kind {opcode:#x} whose lengths do not agree")
+    return record, content

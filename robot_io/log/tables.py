@@ -15,29 +15,23 @@ import numpy as np
 from ballmodel.io.atomic_files import replacing
 from robot_io.log.messages import Ball
 from robot_io.log.reader import SessionLog
+from robot_io.log.topics import TIMINGS
 
 GAP = 0.25  # [s] without a sample, after which a ball of the same number is another trajectory
 SHORTEST = 2  # samples of a trajectory that is worth a row
 
-
+# What ``mjx-tt fit-human`` reads; commands as sent to the robot; states as measured.
 TABLES = {
     "ball.csv": "session,trajectory,t,x,y,z",
     "command.csv": "t,joint,velocity",
     "state.csv": "t,joint,position",
     "events.csv": "t,level,name,text",
-    "ticks.csv": "tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age",
+    "ticks.csv": f"tick,t,{','.join(TIMINGS)}",
 }
 
 
 def export(log: Iterable[SessionLog], folder: str | Path) -> tuple[list[Path], int]:
-    """Writes the tables of a log's pieces into ``folder``, each complete or not at all; their paths, and balls in them.
-
-    ball.csv     session,trajectory,t,x,y,z                what ``mjx-tt fit-human`` reads
-    command.csv  t,joint,velocity                          as sent to the robot
-    state.csv    t,joint,position                          as measured
-    events.csv   t,level,name,text
-    ticks.csv    tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age
-    """
+    """Writes TABLES of a log's pieces into ``folder``, each complete or not at all; their paths, and balls in them."""
     folder, pieces = Path(folder), iter(log)
     first = next(pieces)  # of a log that cannot be read no folder is made
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,22 +50,23 @@ def export(log: Iterable[SessionLog], folder: str | Path) -> tuple[list[Path], i
         ball = Ball(**{name: np.concatenate([getattr(b, name) for b in balls], axis=-1) for name in names})
         found = trajectories(ball)
         for name, indices in found:
-            times = ball.capture_time[indices] - first.start_time
             writers["ball.csv"].writerows(
-                (first.name, name, _seconds(t), *map(_number, position))
-                for t, position in zip(times, ball.position[:, indices].T, strict=True)
+                (first.name, name, _seconds(ball.capture_time[i] - first.start_time), *ball.position[:, i].tolist())
+                for i in indices
             )
     return [folder / name for name in TABLES], len(found)
 
 
 def _rows(log: SessionLog) -> Iterator[tuple[str, Iterator[tuple]]]:
-    start, commands, joints, ticks = log.start_time, log.commands, log.joints, log.ticks
-    ages = (ticks.ball_age, ticks.gantry_age, ticks.arm_age)
-    seconds = (ticks.time - start, ticks.lateness, ticks.policy_seconds, *ages)
-    yield "command.csv", _by_joint(log.robot.joints, commands.time - start, commands.sent)
-    yield "state.csv", _by_joint(log.robot.joints, joints.time - start, joints.position)
-    events = ((_seconds(e.time - start), e.level.name.lower(), e.name, e.text) for e in log.events)
-    yield "events.csv", events
+    start, ticks = log.start_time, log.ticks
+    for name, series, values in (
+        ("command.csv", log.commands, log.commands.sent),
+        ("state.csv", log.joints, log.joints.position),
+    ):
+        rows = zip(series.time - start, values.T.tolist(), strict=True)
+        yield name, ((_seconds(t), *cell) for t, row in rows for cell in zip(log.robot.joints, row, strict=True))
+    yield "events.csv", ((_seconds(e.time - start), e.level.name.lower(), e.name, e.text) for e in log.events)
+    seconds = (ticks.time - start, *(getattr(ticks, name) for name in TIMINGS))
     yield "ticks.csv", ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds, strict=True))
 
 
@@ -99,15 +94,6 @@ def trajectories(ball: Ball) -> list[tuple[str, np.ndarray]]:
     return found
 
 
-def _by_joint(names: tuple[str, ...], times: np.ndarray, values: np.ndarray) -> Iterator[tuple]:
-    for t, row in zip(times, values.T, strict=True):
-        yield from ((_seconds(t), joint, _number(value)) for joint, value in zip(names, row, strict=True))
-
-
 def _seconds(value: float) -> str:
     """To the nanosecond, which is what the log holds."""
     return f"{value:.9f}"
-
-
-def _number(value: float) -> str:
-    return repr(float(value))

@@ -14,27 +14,13 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from scipy.spatial.transform import Rotation
 
-from ballmodel.constants import (
-    BALL_DIAMETER,
-    NET_HEIGHT,
-    NET_OVERHANG,
-    NET_THICKNESS,
-    PADDLE_RADIUS,
-    TABLE_HEIGHT,
-    TABLE_LENGTH,
-    TABLE_THICKNESS,
-    TABLE_WIDTH,
-)
+from ballmodel import constants
 from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import Ball, Event, Joints, Record
@@ -53,10 +39,10 @@ ORANGE, RED = (1.0, 0.5, 0.0, 1.0), (0.75, 0.1, 0.1, 1.0)
 UNTURNED = Rotation.identity()
 NOTHING = '{"joints": [], "capsules": [], "blade_capsules": []}'  # geometry of a robot that is not drawn
 
-TF = Topic("/tf", FrameTransforms)
-SCENE = Topic("/scene", SceneUpdate)
-STATE = Topic("/state", KeyValuePair)
-TOPICS = {topic.name: topic for topic in (TF, SCENE, STATE)}
+TF = Topic("/tf", FrameTransforms, {})
+SCENE = Topic("/scene", SceneUpdate, {})
+STATE = Topic("/state", KeyValuePair, {})
+TOPICS = (TF, SCENE, STATE)
 
 
 class View:
@@ -80,7 +66,7 @@ class View:
         update = SceneUpdate()
         _draw_table(update.entities.add(id="table", frame_id=FRAME))
         ball = update.entities.add(id=BALL_FRAME, frame_id=BALL_FRAME)
-        _add(ball.spheres, (0.0, 0.0, 0.0), (BALL_DIAMETER,) * 3, ORANGE)
+        _add(ball.spheres, (0.0, 0.0, 0.0), (constants.BALL_DIAMETER,) * 3, ORANGE)
         links = {j["name"]: update.entities.add(id=j["name"], frame_id=j["name"]) for j in self._joints}
         for capsule in self._capsules:
             if capsule["name"] in self._blade:
@@ -88,7 +74,8 @@ class View:
             p, q = np.array(capsule["p0"], float), np.array(capsule["p1"], float)
             if capsule["joint"] == FIXED:
                 p, q = self._base.outward(p), self._base.outward(q)
-                links.setdefault(FIXED, update.entities.add(id=FIXED, frame_id=FRAME))
+                if FIXED not in links:
+                    links[FIXED] = update.entities.add(id=FIXED, frame_id=FRAME)
             link, width = links[capsule["joint"]], 2.0 * capsule["radius"]
             _add_cylinder(link, 0.5 * (p + q), q - p, width, math.dist(p, q), STEEL)
             for end in (p, q):
@@ -97,7 +84,7 @@ class View:
         if blade:
             middle = 0.5 * (np.array(blade[0]["p0"]) + np.array(blade[0]["p1"]))
             link = links[blade[0]["joint"]]
-            _add_cylinder(link, middle, _normal(blade), 2.0 * PADDLE_RADIUS, BLADE_THICKNESS, RED)
+            _add_cylinder(link, middle, _normal(blade), 2.0 * constants.PADDLE_RADIUS, BLADE_THICKNESS, RED)
         for entity in update.entities:
             entity.frame_locked = True
         return Encoded(SCENE, time, time, 0, update)
@@ -170,14 +157,29 @@ def _add_frame(message: Any, parent: str, child: str, place: Any, turned: Rotati
 
 
 def _draw_table(table: SceneEntity) -> None:
-    half_x, half_y = 0.5 * (TABLE_WIDTH - LINE), 0.5 * (TABLE_LENGTH - LINE)
-    lines = [(-half_x, 0.0, LINE, TABLE_LENGTH), (0.0, 0.0, 0.003, TABLE_LENGTH), (half_x, 0.0, LINE, TABLE_LENGTH)]
-    lines += [(0.0, -half_y, TABLE_WIDTH, LINE), (0.0, half_y, TABLE_WIDTH, LINE)]
-    leg, middle = TABLE_HEIGHT - TABLE_THICKNESS, -0.5 * (TABLE_HEIGHT + TABLE_THICKNESS)
+    half_x, half_y = 0.5 * (constants.TABLE_WIDTH - LINE), 0.5 * (constants.TABLE_LENGTH - LINE)
+    lines = [
+        (-half_x, 0.0, LINE, constants.TABLE_LENGTH),
+        (0.0, 0.0, 0.003, constants.TABLE_LENGTH),
+        (half_x, 0.0, LINE, constants.TABLE_LENGTH),
+    ]
+    lines += [(0.0, -half_y, constants.TABLE_WIDTH, LINE), (0.0, half_y, constants.TABLE_WIDTH, LINE)]
+    leg, middle = (
+        constants.TABLE_HEIGHT - constants.TABLE_THICKNESS,
+        -0.5 * (constants.TABLE_HEIGHT + constants.TABLE_THICKNESS),
+    )
     shapes = (
-        ((0.0, 0.0, -0.5 * TABLE_THICKNESS), (TABLE_WIDTH, TABLE_LENGTH, TABLE_THICKNESS), BLUE),
+        (
+            (0.0, 0.0, -0.5 * constants.TABLE_THICKNESS),
+            (constants.TABLE_WIDTH, constants.TABLE_LENGTH, constants.TABLE_THICKNESS),
+            BLUE,
+        ),
         *(((x, y, 0.0), (width, length, 0.002), WHITE) for x, y, width, length in lines),
-        ((0.0, 0.0, 0.5 * NET_HEIGHT), (TABLE_WIDTH + 2 * NET_OVERHANG, NET_THICKNESS, NET_HEIGHT), GREY),
+        (
+            (0.0, 0.0, 0.5 * constants.NET_HEIGHT),
+            (constants.TABLE_WIDTH + 2 * constants.NET_OVERHANG, constants.NET_THICKNESS, constants.NET_HEIGHT),
+            GREY,
+        ),
         *(((x, y, middle), (0.05, 0.05, leg), GREY) for x in (-0.6, 0.6) for y in (-1.05, 1.05)),
     )
     for shape in shapes:
@@ -185,8 +187,8 @@ def _draw_table(table: SceneEntity) -> None:
 
 
 def _add(shapes: Any, place: Any, size: Any, colour: Sequence[float], turned: Rotation = UNTURNED) -> Any:
-    pose = Pose(position=_vector(place), orientation=_quaternion(turned))
-    return shapes.add(pose=pose, size=_vector(size), color=Color(**dict(zip("rgba", colour, strict=True))))
+    pose = {"position": _vector(place), "orientation": _quaternion(turned)}
+    return shapes.add(pose=pose, size=_vector(size), color=dict(zip("rgba", colour, strict=True)))
 
 
 def _add_cylinder(
@@ -197,12 +199,12 @@ def _add_cylinder(
     cylinder.bottom_scale = cylinder.top_scale = 1.0
 
 
-def _vector(values: Any) -> Vector3:
-    return Vector3(**dict(zip("xyz", values, strict=True)))
+def _vector(values: Any) -> dict[str, float]:
+    return dict(zip("xyz", values, strict=True))
 
 
-def _quaternion(turned: Rotation) -> Quaternion:
-    return Quaternion(**dict(zip("xyzw", turned.as_quat(), strict=True)))
+def _quaternion(turned: Rotation) -> dict[str, float]:
+    return dict(zip("xyzw", turned.as_quat(), strict=True))
 
 
 def _normal(blade: Sequence[dict[str, Any]]) -> np.ndarray:

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+from mcap.records import Metadata as McapMetadata
 from mcap.writer import CompressionType, Writer
 
 from ballmodel.io.atomic_files import sync_folder
@@ -39,31 +40,24 @@ FORBIDDEN = frozenset('/\\:*?"<>|\0')  # in a file's name, somewhere
 class Session:
     """Start data of a recorder, all of it ready to be written.
 
-    folder, name     the file is folder/name.mcap, and folder/name.mcap.part until it is finished
-    part             of the session; from the second on the file is folder/name.002.mcap and so on
-    metadata         entries of the MCAP metadata record "session"
-    attachments      files kept whole, by name
-    clock_offset_ns  added to times of the control process's clock gives nanoseconds since 1970
+    first        the session's first file, with its name when it is finished
+    metadata     entries of the MCAP metadata record "session"
+    attachments  files kept whole, by name
+    part         of the session, from 1
     """
 
-    folder: Path
-    name: str
+    first: Path
     metadata: dict[str, str]
     attachments: dict[str, bytes]
-    clock_offset_ns: int
     part: int = 1
 
     @property
     def path(self) -> Path:
-        return part_of(self.folder / f"{self.name}{SUFFIX}", self.part)
+        return part_of(self.first, self.part)
 
     @property
     def unfinished(self) -> Path:
         return self.path.with_suffix(UNFINISHED)
-
-    def following(self) -> Session:
-        """The session's next file."""
-        return replace(self, part=self.part + 1, metadata=self.metadata | {"part": str(self.part + 1)})
 
 
 def part_of(path: Path, part: int) -> Path:
@@ -123,13 +117,8 @@ def session(
     hidden = sorted({*own, CONTRACT, "checksum"} & set(metadata))
     if hidden:
         raise LogError(f"metadata {', '.join(hidden)}: written by the log itself, choose another key")
-    made = Session(
-        Path(folder).absolute(),
-        name,
-        as_strings({**own, **metadata}),
-        {key: value.encode() if isinstance(value, str) else bytes(value) for key, value in attachments.items()},
-        clock_offset_ns,
-    )
+    contents = {key: value.encode() if isinstance(value, str) else bytes(value) for key, value in attachments.items()}
+    made = Session(Path(folder).absolute() / f"{name}{SUFFIX}", as_strings({**own, **metadata}), contents)
     for path in (made.path, made.unfinished):
         if path.exists():
             raise LogError(f"{path}: exists; choose another name, or salvage and remove it")
@@ -154,10 +143,23 @@ def robot_of(metadata: Mapping[str, str], where: str) -> Contract:
         raise LogError(f"{where}: metadata {CONTRACT!r}: {error}") from None
 
 
-def checksum(name: str, entries: Mapping[str, str]) -> str:
+def checksum(record: McapMetadata) -> str:
     """SHA-256 of a metadata record, which MCAP protects with no CRC until the file is complete."""
-    kept = {key: value for key, value in entries.items() if key != "checksum"}
-    return hashlib.sha256(json.dumps([name, kept], sort_keys=True).encode()).hexdigest()
+    kept = {key: value for key, value in record.metadata.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps([record.name, kept], sort_keys=True).encode()).hexdigest()
+
+
+def start_file(stream: IO[bytes], library: str) -> Writer:
+    """MCAP's writer with a log's sizes and checksums, its header written."""
+    writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile="", library=library)
+    return writer
+
+
+def add_metadata(writer: Writer, name: str, entries: Mapping[str, Any]) -> None:
+    """Writes a metadata record with its checksum. Raises LogError for a value that is no JSON data."""
+    record = McapMetadata(name, as_strings(entries))
+    writer.add_metadata(name, {**record.metadata, "checksum": checksum(record)})
 
 
 class SessionWriter:
@@ -168,10 +170,11 @@ class SessionWriter:
     """
 
     def __init__(self, session: Session, largest: int = LARGEST_FILE) -> None:
-        self._first, self._largest = session.path, largest
-        robot = robot_of(session.metadata, session.name)
+        self._largest, described = largest, session.metadata
+        robot = robot_of(described, described["name"])
+        self._offset = int(described["clock_offset_ns"])
         self._topics = topics(robot)
-        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))), robot)
+        self._view = view.View(Frame(*map(tuple, json.loads(described.get("robot_base", "[]")))), robot)
         self._open(session)
 
     def _open(self, session: Session) -> None:
@@ -179,34 +182,31 @@ class SessionWriter:
         self._end: End | None = None
         self._unflushed = False
         self.messages = 0
-        session.folder.mkdir(parents=True, exist_ok=True)
+        session.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(session.unfinished, "xb")
-        self._writer = Writer(
-            self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True
-        )
-        self._writer.start(profile="", library=f"robot_io.log {FORMAT_VERSION}")
-        self._add_metadata("session", session.metadata)
-        start = round(float(session.metadata["start_time"]) * NANO) + session.clock_offset_ns
+        self._writer = start_file(self._file, f"robot_io.log {FORMAT_VERSION}")
+        add_metadata(self._writer, "session", session.metadata)
+        start_time = float(session.metadata["start_time"])
+        start = self._nanoseconds(start_time)
         for name, content in session.attachments.items():
             media_type = "application/octet-stream" if b"\0" in content else "text/plain"
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        for topic in (*self._topics.values(), *view.TOPICS.values()):
-            schema_name = topic.message.DESCRIPTOR.full_name
-            if schema_name not in schemas:
-                schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
-            self._channels[topic.name] = self._writer.register_channel(
-                topic.name, "protobuf", schemas[schema_name], topic.metadata
-            )
-        self._add_message(self._view.scene(float(session.metadata["start_time"])))
+        for topic in (*self._topics.values(), *view.TOPICS):
+            name = topic.message.DESCRIPTOR.full_name
+            if name not in schemas:
+                schemas[name] = self._writer.register_schema(name, "protobuf", topic.schema())
+            channel = self._writer.register_channel(topic.name, "protobuf", schemas[name], topic.metadata)
+            self._channels[topic.name] = channel
+        self._add_message(self._view.scene(start_time))
         self._file.flush()
 
     def write(self, packed: bytes) -> None:
         """Takes a packed record. Raises LogError for one that is malformed; nothing of it is written then."""
         record = unpack(packed)
         if isinstance(record, Metadata):
-            self._add_metadata(record.name, record.entries)
+            add_metadata(self._writer, record.name, record.entries)
         elif isinstance(record, End):
             self._end = record
         else:
@@ -216,7 +216,9 @@ class SessionWriter:
         if self._file.tell() >= self._largest and not self._end:
             self._end = End(0, 0)
             self.finish()
-            self._open(self._session.following())
+            following = self._session.part + 1  # its metadata say so
+            metadata = self._session.metadata | {"part": str(following)}
+            self._open(replace(self._session, part=following, metadata=metadata))
 
     def flush(self) -> None:
         """Ends the chunk and brings everything so far to the disk. Raises OSError, also for a file that is gone."""
@@ -233,18 +235,14 @@ class SessionWriter:
 
         Returns the session's first file.
         """
-        end = self._end or End(0, 0)
-        self._add_metadata(
-            "end",
-            as_strings(
-                {
-                    "closed": self._end is not None,
-                    "dropped": end.dropped if self._end else "unknown",
-                    "malformed": end.malformed + malformed,
-                    "messages": self.messages,
-                }
-            ),
-        )
+        end = self._end or End("unknown", 0)
+        entries = {
+            "closed": self._end is not None,
+            "dropped": end.dropped,
+            "malformed": end.malformed + malformed,
+            "messages": self.messages,
+        }
+        add_metadata(self._writer, "end", entries)
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -254,7 +252,7 @@ class SessionWriter:
             raise FileExistsError(f"{path} appeared meanwhile; the log is complete as {self._session.unfinished}")
         os.rename(self._session.unfinished, path)
         sync_folder(path.parent)
-        return self._first
+        return self._session.first
 
     def _add_message(self, encoded: Encoded) -> None:
         published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
@@ -269,13 +267,10 @@ class SessionWriter:
         )
         self.messages += 1
 
-    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        self._writer.add_metadata(name, {**entries, "checksum": checksum(name, entries)})
-
     def _nanoseconds(self, seconds: float) -> int:
         if not math.isfinite(seconds):
             raise LogError(f"time {seconds}: a finite number of seconds is needed")
-        nanoseconds = round(seconds * NANO) + self._session.clock_offset_ns
+        nanoseconds = round(seconds * NANO) + self._offset
         if not 0 <= nanoseconds < 1 << 63:
             raise LogError(f"time {seconds}: is {nanoseconds} ns since 1970, MCAP holds no time before that")
         return nanoseconds

@@ -18,8 +18,8 @@ import numpy as np
 from robot_io import contract
 from robot_io.contract import Contract
 from robot_io.errors import ContractError
-from robot_io.policy.backends import LoopPolicy, make_policy
-from robot_io.policy.policy import ExportedNetwork, Policy
+from robot_io.policy.backends import make_policy
+from robot_io.policy.policy import ExportedNetwork, LoopPolicy, Policy
 
 SCHEMA_VERSION = 1
 NORMALISER_FORMULA = "(observation - mean) * inverse_scale"
@@ -39,18 +39,9 @@ USER_DEFINED_FILES = (MANIFEST, MANIFEST_DIGEST, *USER_DEFINED_HASHED_FILES)
 USER_DEFINED_TOLERANCE = 1e-5  # of the exported step in float32 on another machine
 
 USER_DEFINED_ARCHITECTURE = ("network", "parameters", "n_parameters", "step")  # of a user-defined network
-MANIFEST_KEYS = (
-    "schema_version",
-    "contract",
-    "architecture",
-    "normaliser",
-    "golden",
-    "files",
-    "provenance",
-    "written_with",
-)
+MANIFEST_KEYS = {"schema_version", "contract", "architecture", "normaliser", "golden", "files", "provenance"}
+MANIFEST_KEYS |= {"written_with"}
 
-_REEXPORT = "export the policy again with this version of the program"
 _RECOPY = "copy the artefact again from where it was exported"
 
 
@@ -97,9 +88,7 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
     folder = Path(folder)
     contents = _read_files(folder)
     manifest = _verified_manifest(folder, contents)
-    for name in contents:
-        if name in (MANIFEST, MANIFEST_DIGEST):
-            continue
+    for name in set(contents) - {MANIFEST, MANIFEST_DIGEST}:
         found, expected = sha256(contents[name]), manifest["files"].get(name)
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
@@ -114,42 +103,39 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
         source = contents[NETWORK].decode()
         network = ExportedNetwork(described["network"], tuple(shapes.items()), contents[JAX_EXPORT], source)
         wanted = {"observation": ((count, seen), "float32"), "action": ((count, answered), "float64")}
-    parameters = _arrays(
-        folder / PARAMETERS, contents[PARAMETERS], {name: (shape, "float32") for name, shape in shapes.items()}
-    )
-    golden_input, golden_action = _arrays(folder / GOLDEN, contents[GOLDEN], wanted).values()
-    theta = np.concatenate([parameter.ravel() for parameter in parameters.values()])
+    parameters = _arrays(folder, PARAMETERS, contents, {name: (shape, "float32") for name, shape in shapes.items()})
+    golden_input, golden_action = _arrays(folder, GOLDEN, contents, wanted)
+    theta = np.concatenate([parameter.ravel() for parameter in parameters])
     policy = Policy(theta, *_normaliser(folder / MANIFEST, manifest["normaliser"], seen), network)
     try:
-        action = policy.apply(golden_input) if network is None else _play(policy, golden_input)
+        action = answer(policy, golden_input, robot)
     except Exception as error:  # JAX absent, or of a version that reads the export no more
         if network is None:
             raise
-        raise ArtefactError(
-            f"{folder / JAX_EXPORT}: the network {network.name!r} cannot be run here ({type(error).__name__}: "
-            f"{error}); it takes a JAX at most six months from {manifest['written_with']}; {_REEXPORT}"
-        ) from error
+        age = f"it takes a JAX at most six months from {manifest['written_with']}"
+        what = f"the network {network.name!r} cannot be run here ({type(error).__name__}: {error}); {age}"
+        raise _stale(folder / JAX_EXPORT, what) from error
     difference, allowed = float(np.max(np.abs(action - golden_action))), tolerance(network)
     if not difference <= allowed:
-        raise ArtefactError(
-            f"{folder / GOLDEN}: this machine's policy differs from the golden outputs by {difference:.3g}, allowed is "
-            f"{allowed:g}; do not run it: the forward pass, NumPy or JAX changed since the export, so {_REEXPORT}"
-        )
+        what = f"this machine's policy differs from the golden outputs by {difference:.3g}, allowed is {allowed:g}"
+        why = "do not run it: the forward pass, NumPy or JAX changed since the export"
+        raise _stale(folder / GOLDEN, f"{what}; {why}")
     return Artefact(folder, sha256(contents[MANIFEST]), manifest, policy, golden_input, golden_action)
 
 
 load_artefact = load  # its name in ``robot_io``
 
 
+def answer(policy: Policy, golden_input: np.ndarray, robot: Contract) -> np.ndarray:
+    """The reference's actions, as ``Artefact`` has them, by the form of the policy that the robot runs."""
+    if policy.network is None:
+        return policy.apply(golden_input)
+    return make_policy("jit", policy, robot).episode(golden_input)
+
+
 def tolerance(network: ExportedNetwork | None) -> float:
     """Largest difference allowed between a policy's answers and its golden outputs."""
     return GOLDEN_TOLERANCE if network is None else USER_DEFINED_TOLERANCE
-
-
-def _play(policy: Policy, observations: np.ndarray) -> np.ndarray:
-    from robot_io.policy.jax_policy import ExportedPolicy  # imports JAX
-
-    return ExportedPolicy(policy).episode(observations)
 
 
 def sha256(content: bytes) -> str:
@@ -190,22 +176,15 @@ def check_robot(source: str | Path, robot: contract.Contract, standing: contract
 def differences(found: Any, expected: Any, path: str) -> list[str]:
     """Differences of two pieces of JSON-like data, one line a leaf: "contract.version: found 2, expected 1"."""
     if isinstance(found, dict) and isinstance(expected, dict):
+        lines = [f"{path}.{key}: missing, expected {expected[key]!r}" for key in expected if key not in found]
+        lines += [f"{path}.{key}: found {found[key]!r}, not expected" for key in found if key not in expected]
+        shared = [(f"{path}.{key}", found[key], expected[key]) for key in expected if key in found]
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         lines = []
-        for key in [*expected, *(k for k in found if k not in expected)]:
-            if key not in found:
-                lines.append(f"{path}.{key}: missing, expected {expected[key]!r}")
-            elif key not in expected:
-                lines.append(f"{path}.{key}: found {found[key]!r}, not expected")
-            else:
-                lines += differences(found[key], expected[key], f"{path}.{key}")
-        return lines
-    if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
-        return [
-            line
-            for i, (f, e) in enumerate(zip(found, expected, strict=True))
-            for line in differences(f, e, f"{path}[{i}]")
-        ]
-    return [] if found == expected else [f"{path}: found {found!r}, expected {expected!r}"]
+        shared = [(f"{path}[{i}]", f, e) for i, (f, e) in enumerate(zip(found, expected, strict=True))]
+    else:
+        return [] if found == expected else [f"{path}: found {found!r}, expected {expected!r}"]
+    return lines + [line for place, one, other in shared for line in differences(one, other, place)]
 
 
 def _read_files(folder: Path) -> dict[str, bytes]:
@@ -225,6 +204,10 @@ def _read_files(folder: Path) -> dict[str, bytes]:
         raise ArtefactError(f"{error.filename}: cannot be read ({error.strerror}); {_RECOPY}") from error
 
 
+def _stale(path: Path, what: str) -> ArtefactError:
+    return ArtefactError(f"{path}: {what}; export the policy again with this version of the program")
+
+
 def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, Any]:
     path, raw = folder / MANIFEST, contents[MANIFEST]
     if contents[MANIFEST_DIGEST] != digest_line(raw):
@@ -233,57 +216,56 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     try:
         manifest = json.loads(raw)
     except ValueError as error:
-        raise ArtefactError(f"{path}: not JSON ({error}); {_REEXPORT}") from error
+        raise _stale(path, f"not JSON ({error})") from error
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if version != SCHEMA_VERSION:
-        raise ArtefactError(f"{path}: schema_version: found {version!r}, expected {SCHEMA_VERSION}; {_REEXPORT}")
-    if set(manifest) != set(MANIFEST_KEYS):
-        raise ArtefactError(f"{path}: keys are {sorted(manifest)}, expected {sorted(MANIFEST_KEYS)}; {_REEXPORT}")
+        raise _stale(path, f"schema_version: found {version!r}, expected {SCHEMA_VERSION}")
+    if set(manifest) != MANIFEST_KEYS:
+        raise _stale(path, f"keys are {sorted(manifest)}, expected {sorted(MANIFEST_KEYS)}")
     for key in ("normaliser", "golden", "files"):
         if not isinstance(manifest[key], dict):
-            raise ArtefactError(f"{path}: {key}: found {manifest[key]!r}, expected an object; {_REEXPORT}")
+            raise _stale(path, f"{key}: found {manifest[key]!r}, expected an object")
     try:
         robot = contract.from_description(manifest["contract"])
     except ContractError as error:
-        raise ArtefactError(f"{path}: contract: {error}; {_REEXPORT}") from error
-    expectations = [("contract", contract.describe(robot)), ("architecture", architecture(robot))]
-    if NETWORK in contents:
-        described = manifest["architecture"]
-        if not isinstance(described, dict) or set(described) != set(USER_DEFINED_ARCHITECTURE):
-            raise ArtefactError(
-                f"{path}: architecture: found {described!r}, expected {USER_DEFINED_ARCHITECTURE}; {_REEXPORT}"
-            )
-        expectations.pop()
-    for key, expected in expectations:
+        raise _stale(path, f"contract: {error}") from error
+    expectations, described = {"contract": contract.describe(robot)}, manifest["architecture"]
+    if NETWORK not in contents:
+        expectations["architecture"] = architecture(robot)
+    elif not isinstance(described, dict) or set(described) != set(USER_DEFINED_ARCHITECTURE):
+        raise _stale(path, f"architecture: found {described!r}, expected {USER_DEFINED_ARCHITECTURE}")
+    for key, expected in expectations.items():
         lines = differences(manifest[key], json.loads(json.dumps(expected)), key)
         if lines:
-            raise ArtefactError(f"{path}: made for another robot interface: {'; '.join(lines)}; {_REEXPORT}")
+            raise _stale(path, f"made for another robot interface: {'; '.join(lines)}")
     return manifest
 
 
-def _arrays(path: Path, content: bytes, expected: dict[str, tuple[tuple[int, ...], str]]) -> dict[str, np.ndarray]:
+def _arrays(
+    folder: Path, file: str, contents: dict[str, bytes], expected: dict[str, tuple[tuple[int, ...], str]]
+) -> list[np.ndarray]:
+    """A file's arrays in the order of ``expected``, which has their shapes and types."""
+    path = folder / file
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        with np.load(io.BytesIO(contents[file]), allow_pickle=False) as archive:
+            arrays = dict(archive)
     except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise ArtefactError(f"{path}: not a NumPy archive ({error}); {_REEXPORT}") from error
+        raise _stale(path, f"not a NumPy archive ({error})") from error
     if set(arrays) != set(expected):
-        raise ArtefactError(f"{path}: holds {sorted(arrays)}, expected {sorted(expected)}; {_REEXPORT}")
+        raise _stale(path, f"holds {sorted(arrays)}, expected {sorted(expected)}")
     for name, (shape, dtype) in expected.items():
         array = arrays[name]
         if array.shape != shape or array.dtype != dtype:
-            raise ArtefactError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} {shape}; {_REEXPORT}")
+            raise _stale(path, f"{name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
         if not np.all(np.isfinite(array)):
             raise ArtefactError(f"{path}: {name} has a non-finite number; export an earlier checkpoint")
-    return {name: arrays[name] for name in expected}
+    return [arrays[name] for name in expected]
 
 
 def _normaliser(path: Path, normaliser: dict[str, Any], size: int) -> tuple[np.ndarray, np.ndarray]:
     formula = normaliser.get("formula")
     if formula != NORMALISER_FORMULA:
-        raise ArtefactError(
-            f"{path}: normaliser.formula: found {formula!r}, expected {NORMALISER_FORMULA!r}; {_REEXPORT}"
-        )
+        raise _stale(path, f"normaliser.formula: found {formula!r}, expected {NORMALISER_FORMULA!r}")
     arrays = []
     for key in ("mean", "inverse_scale"):
         found = normaliser.get(key)
@@ -292,7 +274,6 @@ def _normaliser(path: Path, normaliser: dict[str, Any], size: int) -> tuple[np.n
         except (TypeError, ValueError):
             array = np.empty(0)
         if array.shape != (size,) or not np.all(np.isfinite(array)):
-            wanted = f"{size} finite numbers"
-            raise ArtefactError(f"{path}: normaliser.{key}: found {found!r}, expected {wanted}; {_REEXPORT}")
+            raise _stale(path, f"normaliser.{key}: found {found!r}, expected {size} finite numbers")
         arrays.append(array)
     return arrays[0], arrays[1]

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 
 from robot_io import contract
 from robot_io.policy.numpy_policy import StreamingPolicy
-from robot_io.policy.policy import Policy
+from robot_io.policy.policy import LoopPolicy, Policy
 
 TRIALS = 300  # steps of each that are timed, after as many that are not
 SLOWER = 0.2e-3  # [s] by which nine of ten of JAX's steps may take longer than NumPy's: 1.5 % of a control period
-
-
-class LoopPolicy(Protocol):
-    """A policy in the control loop."""
-
-    def reset(self) -> None:
-        """Forgets everything: the next observation begins an episode."""
-
-    def step(self, observation: np.ndarray) -> np.ndarray:
-        """Action (joints,) in [-1, 1] for an observation (n,)."""
 
 
 def make_policy(backend: str, policy: Policy, robot: contract.Contract = contract.PAPER) -> LoopPolicy:
@@ -34,7 +23,7 @@ def make_policy(backend: str, policy: Policy, robot: contract.Contract = contrac
     if backend == "jit":
         from robot_io.policy import jax_policy  # imports JAX
 
-        return (jax_policy.JitPolicy if policy.network is None else jax_policy.ExportedPolicy)(policy)
+        return (jax_policy.JitPolicy if policy.network is None else jax_policy.ExportedPolicy)(policy, robot)
     raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 

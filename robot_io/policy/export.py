@@ -28,8 +28,8 @@ from robot_io import contract
 from robot_io.policy import artefact as artefacts
 from robot_io.policy import jax_policy
 from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.backends import make_policy
 from robot_io.policy.jax_policy import Policy
-from robot_io.policy.policy import forward
 
 AGREEMENT = 1e-5  # largest difference allowed between any two forms of the policy, of an action in [-1, 1]
 GOLDEN_COUNT = 64
@@ -90,58 +90,40 @@ def write(
     return report
 
 
-def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str, Any]:
-    """Loads an artefact and compares its four forms on random observation histories.
+def verify(folder: str | Path, seed: int = 0) -> dict[str, Any]:
+    """Loads an artefact and compares its four forms on 1,000 random observation histories.
 
-    Returns {"digest", "histories", "tolerance", "largest_difference" (between any two forms), "from_reference" (per
-    form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
+    Returns {"digest", "largest_difference" (between any two forms), "from_reference" (per form against the NumPy
+    reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
     """
     artefact = artefacts.load(folder)
     policy = artefact.policy
-    history = random_histories(policy, histories, seed)
+    history = random_histories(policy, 1000, seed)
     if policy.network is None:
-        session = onnxruntime.InferenceSession(
-            (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
-        )
-        exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
+        model, exported = ((artefact.folder / name).read_bytes() for name in (artefacts.ONNX, artefacts.JAX_EXPORT))
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
         reference, allowed = policy.apply(history), AGREEMENT
         with jax.default_device(jax.devices("cpu")[0]):
             actions = {
-                "jit": np.asarray(_jitted_forward(policy.astype(np.float32), history)),
+                "jit": np.asarray(jax_policy.jitted_forward(policy.astype(np.float32), history)),
                 "onnxruntime": session.run(["action"], {"history": history})[0],
-                "jax_export": np.asarray(exported.call(history)),
+                "jax_export": np.asarray(jax.export.deserialize(bytearray(exported)).call(history)),
             }
     else:
         # Its other form, the user's Python, is not run here: golden.npz is what that wrote. The exported step must
         # remember nothing of an episode before.
-        runner, episode = jax_policy.ExportedPolicy(policy), history[0].T
+        runner, episode = make_policy("jit", policy, artefact.contract), history[0].T
         reference, allowed = runner.episode(episode), 0.0
         actions = {"jax_export": runner.episode(episode)}
-    stacked = np.stack([reference, *actions.values()])
     from_reference = {name: float(np.max(np.abs(action - reference))) for name, action in actions.items()}
-    largest = float(np.max(stacked.max(axis=0) - stacked.min(axis=0)))
+    largest = float(np.max(np.ptp([reference, *actions.values()], axis=0)))
     if not largest <= allowed:
         raise ArtefactError(
             f"{folder}: its forms of the policy, or its answers to the same episode played twice, differ by "
             f"{largest:.3g} (from the reference: {from_reference}), allowed is {allowed:g}; do not run it, export the "
             "policy again"
         )
-    return {
-        "digest": artefact.digest,
-        "histories": histories,
-        "tolerance": AGREEMENT if policy.network is None else artefacts.USER_DEFINED_TOLERANCE,
-        "largest_difference": largest,
-        "from_reference": from_reference,
-    }
-
-
-def _forward(policy: Policy, history: jax.Array) -> jax.Array:
-    """Histories (8, 11, B) to actions (8, B), not in an accelerator's short format."""
-    with jax.default_matmul_precision("highest"):
-        return forward(policy, history, xp=jnp)
-
-
-_jitted_forward = jax.jit(_forward)
+    return {"digest": artefact.digest, "largest_difference": largest, "from_reference": from_reference}
 
 
 def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
@@ -158,39 +140,30 @@ def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onn
     Its metadata say what the numbers are: names, units, the scale of each action and the rate; whole as JSON
     under ``contract``.
     """
-    parameters = policy.parameters
+    parameters, nodes = policy.parameters, []
     constants = {"mean": policy.mean[:, None], "inverse_scale": policy.inv_std[:, None]}
-    nodes = [
-        helper.make_node("Sub", ["history", "mean"], ["centred"]),
-        helper.make_node("Mul", ["centred", "inverse_scale"], ["normalised"]),
-        helper.make_node("Transpose", ["normalised"], ["layer0"], perm=[2, 1, 0]),  # Conv wants (B, channels, time)
-    ]
+
+    def add(kind: str, inputs: str, outputs: str, **attributes: Any) -> None:
+        nodes.append(helper.make_node(kind, inputs.split(), outputs.split(), **attributes))
+
+    add("Sub", "history mean", "centred")
+    add("Mul", "centred inverse_scale", "normalised")
+    add("Transpose", "normalised", "layer0", perm=[2, 1, 0])  # Conv wants (B, channels, time)
     for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED, strict=True), start=1):
         constants[f"kernel{i}"] = np.ascontiguousarray(parameters[f"conv{i}/kernel"].transpose(2, 1, 0))
         constants[f"bias{i}"] = parameters[f"conv{i}/bias"]
-        nodes.append(
-            helper.make_node(
-                "Conv",
-                [f"layer{i - 1}", f"kernel{i}", f"bias{i}"],
-                [f"conv{i}"],
-                kernel_shape=[contract.KERNEL],
-                dilations=[dilation],
-            )
-        )
+        inputs, taps = f"layer{i - 1} kernel{i} bias{i}", [contract.KERNEL]
+        add("Conv", inputs, f"conv{i}", kernel_shape=taps, dilations=[dilation])
         if gated:
-            nodes += [
-                helper.make_node("Split", [f"conv{i}"], [f"signal{i}", f"gate{i}"], axis=1),
-                helper.make_node("Tanh", [f"signal{i}"], [f"tanh{i}"]),
-                helper.make_node("Sigmoid", [f"gate{i}"], [f"sigmoid{i}"]),
-                helper.make_node("Mul", [f"tanh{i}", f"sigmoid{i}"], [f"layer{i}"]),
-            ]
+            add("Split", f"conv{i}", f"signal{i} gate{i}", axis=1)
+            add("Tanh", f"signal{i}", f"tanh{i}")
+            add("Sigmoid", f"gate{i}", f"sigmoid{i}")
+            add("Mul", f"tanh{i} sigmoid{i}", f"layer{i}")
         else:
-            nodes.append(helper.make_node("Tanh", [f"conv{i}"], [f"layer{i}"]))
+            add("Tanh", f"conv{i}", f"layer{i}")
     constants["time_axis"] = np.array([2], np.int64)
-    nodes += [
-        helper.make_node("Squeeze", [f"layer{len(contract.FILTERS)}", "time_axis"], ["batch_first"]),
-        helper.make_node("Transpose", ["batch_first"], ["action"], perm=[1, 0]),
-    ]
+    add("Squeeze", f"layer{len(contract.FILTERS)} time_axis", "batch_first")
+    add("Transpose", "batch_first", "action", perm=[1, 0])
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
         nodes,
@@ -217,36 +190,35 @@ def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onn
 def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export``, any batch size."""
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
-    return jax_policy.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
+    return jax_policy.serialised(partial(jax_policy.exact_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
 def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:
     """Files of the artefact by name. given: the user-defined network as it was before its export, or None."""
     history = random_histories(policy, GOLDEN_COUNT, seed=1)
-    if policy.network is None:
-        action = policy.apply(history)
-        contents = {
-            artefacts.PARAMETERS: _npz(policy.parameters),
-            artefacts.GOLDEN: _npz({"history": history, "action": action}),
+    network = policy.network
+    if network is None:
+        golden = {"history": history, "action": policy.apply(history)}
+        forms = {
             artefacts.ONNX: onnx_model(policy, robot).SerializeToString(),
             artefacts.JAX_EXPORT: jax_export(policy),
         }
         architecture = artefacts.architecture(robot)
     else:
-        network, episode = policy.network, np.ascontiguousarray(history[0].T)
-        action = jax_policy.reference(given, policy, episode).astype(np.float64)
-        contents = {
-            artefacts.PARAMETERS: _npz(network.unflatten(policy.theta)),
-            artefacts.GOLDEN: _npz({"observation": episode, "action": action}),
-            artefacts.NETWORK: network.source.encode(),
-            artefacts.JAX_EXPORT: network.exported,
-        }
+        episode = np.ascontiguousarray(history[0].T)
+        if given is network:  # all that is left of a network after fine-tuning
+            action = artefacts.answer(policy, episode, robot)
+        else:
+            action = jax_policy.reference(given, policy, episode)
+        golden = {"observation": episode, "action": action.astype(np.float64)}
+        forms = {artefacts.NETWORK: network.source.encode(), artefacts.JAX_EXPORT: network.exported}
         architecture = {
             "network": network.name,
             "parameters": {name: list(shape) for name, shape in network.shapes},
             "n_parameters": network.size,
             "step": f"{artefacts.JAX_EXPORT}: theta, mean, inverse_scale, first, state, observation -> action, state",
         }
+    contents = {artefacts.PARAMETERS: _npz(policy.parameters), artefacts.GOLDEN: _npz(golden), **forms}
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
         "contract": contract.describe(robot),

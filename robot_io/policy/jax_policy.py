@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -15,84 +15,66 @@ import jax.numpy as jnp
 import numpy as np
 
 from robot_io import contract
-from robot_io.policy.policy import ExportedNetwork, forward
+from robot_io.policy.policy import ExportedNetwork, LoopPolicy, forward
 from robot_io.policy.policy import Policy as Policy
 
 jax.tree_util.register_dataclass(Policy, data_fields=["theta", "mean", "inv_std"], meta_fields=["network"])
 
 PLATFORMS = ("cpu", "cuda", "tpu")  # on which an export runs
 _FRAMES = "jax_traceback_in_locations_limit"
+
+
+def exact_forward(policy: Policy, history: Any) -> jax.Array:
+    """Histories (8, 11, B) to actions (8, B), not in an accelerator's short format."""
+    with jax.default_matmul_precision("highest"):
+        return forward(policy, history, xp=jnp)
+
+
 # One compiled function for all policies: parameters are arguments, so another policy does not compile again.
-_forward = jax.jit(partial(forward, xp=jnp))
+jitted_forward = jax.jit(exact_forward)
 
 
-class _LoopPolicy:
-    """Fed one observation (n,) per tick; computed by the CPU, which answers soonest.
+class _JaxPolicy(LoopPolicy):
+    """Computed by the CPU, which answers soonest.
 
     Answers come from the calling thread at once, not from a queue: a fifth of the latency.
     """
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, robot: contract.Contract = contract.PAPER) -> None:
+        super().__init__(policy, robot)
         jax.config.update("jax_cpu_enable_async_dispatch", False)
         self._cpu_policy = jax.device_put(policy.astype(np.float32), jax.local_devices(backend="cpu")[0])
-        self._first = True
         self.step(np.zeros(policy.n_observation))  # compiles
         self.reset()
 
-    def reset(self) -> None:
-        """Forgets everything: the next observation begins an episode."""
-        self._first = True
 
-    def step(self, observation: np.ndarray) -> np.ndarray:
-        """Action (joints,) in [-1, 1]. Raises ValueError for another shape or a non-finite number."""
-        observation = np.asarray(observation, np.float32)
-        size = self._cpu_policy.n_observation
-        if observation.shape != (size,) or not np.isfinite(observation).all():
-            raise ValueError(f"observation {observation}: expected {size} finite numbers")
-        action = self._act(observation)
-        self._first = False
-        return action
-
-    def _act(self, observation: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
-
-
-class JitPolicy(_LoopPolicy):
+class JitPolicy(_JaxPolicy):
     """The paper's network: the same numbers as ``numpy_policy.StreamingPolicy``.
 
     It computes the whole history at every tick: on one column that costs less than a second call would.
     """
 
-    def __init__(self, policy: Policy) -> None:
-        self._history = np.zeros((contract.HISTORY, policy.n_observation, 1), np.float32)
-        super().__init__(policy)
-
-    def _act(self, observation: np.ndarray) -> np.ndarray:
-        if self._first:
-            self._history[:, :, 0] = observation
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
+        if first:
+            self._history = np.tile(observation[:, None], (contract.HISTORY, 1, 1))
         else:
             self._history[:-1] = self._history[1:]
             self._history[-1, :, 0] = observation
-        return np.asarray(_forward(self._cpu_policy, self._history))[:, 0]
+        return np.asarray(jitted_forward(self._cpu_policy, self._history))[:, 0]
 
 
-class ExportedPolicy(_LoopPolicy):
+class ExportedPolicy(_JaxPolicy):
     """A user-defined network."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, robot: contract.Contract = contract.PAPER) -> None:
         self._call, self._state = _compiled(policy.network)
-        super().__init__(policy)
+        super().__init__(policy, robot)
 
-    def _act(self, observation: np.ndarray) -> np.ndarray:
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         policy = self._cpu_policy
         arrays = policy.theta, policy.mean, policy.inv_std
-        action, self._state = self._call(*arrays, np.bool_(self._first), self._state, observation)
+        action, self._state = self._call(*arrays, np.bool_(first), self._state, observation)
         return np.asarray(action)
-
-    def episode(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (T, joints) for the observations (T, n) of one episode."""
-        self.reset()
-        return np.stack([self.step(observation) for observation in observations])
 
 
 @lru_cache(maxsize=8)
@@ -149,12 +131,7 @@ def serialised(function: Callable[..., Any], *shapes: Any) -> bytes:
 
 
 def reference(network: Any, policy: Policy, observations: np.ndarray) -> np.ndarray:
-    """Actions (T, 8) for one episode's observations (T, 11), by the user's Python itself, tick by tick.
-
-    Of a network that has only its exported form left, as after fine-tuning, by that.
-    """
-    if isinstance(network, ExportedNetwork):
-        return ExportedPolicy(policy).episode(observations)
+    """Actions (T, 8) for one episode's observations (T, 11), by the user's Python itself, tick by tick."""
     parameters = jax.tree.map(jnp.asarray, network.unflatten(np.asarray(policy.theta, np.float32)))
     rows = (observations - policy.mean) * policy.inv_std
     state, actions = network.start(parameters, jnp.asarray(rows[0])), []

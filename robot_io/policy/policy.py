@@ -67,8 +67,9 @@ class Policy:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Kernels and biases by name, shaped as ``contract.parameter_shapes`` with the axis P last."""
-        return contract.unflatten(self.theta, contract.parameter_shapes(self.n_observation - 3))
+        """Arrays by name, shaped as ``contract.parameter_shapes`` or the network's, with the axis P last."""
+        shapes = contract.parameter_shapes(self.n_observation - 3) if self.network is None else self.network.shapes
+        return contract.unflatten(self.theta, dict(shapes))
 
     def astype(self, dtype: type) -> Policy:
         """The policy with NumPy arrays of that type."""
@@ -126,6 +127,51 @@ def step(layer: Layer, past: Past, x: Any) -> tuple[Any, Past]:
     return x, tuple(later)
 
 
+class LoopPolicy:
+    """A policy in the control loop: fed one observation per control tick."""
+
+    dtype: type = np.float32  # in which it computes
+
+    def __init__(self, policy: Policy, robot: contract.Contract = contract.PAPER) -> None:
+        """``robot``: whose contract the policy was trained for. Raises ValueError where it has other joints."""
+        if policy.n_observation != robot.n_observation:
+            raise ValueError(
+                f"the policy has observations of {policy.n_observation} numbers, those of {robot.robot} have "
+                f"{robot.n_observation}"
+            )
+        self._names = robot.observation_names
+        self._first = True
+
+    def reset(self) -> None:
+        """Forgets everything: the next observation begins an episode."""
+        self._first = True
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        """Action (joints,) in [-1, 1] for the newest observation (n,).
+
+        Raises ValueError for another shape or a non-finite number, and then remembers nothing of it.
+        """
+        observation = np.asarray(observation, self.dtype)
+        size = len(self._names)
+        if observation.shape != (size,):
+            raise ValueError(f"observation has shape {observation.shape}, expected {size} finite numbers")
+        if not np.isfinite(observation).all():
+            bad = [name for name, value in zip(self._names, observation, strict=True) if not np.isfinite(value)]
+            raise ValueError(f"observation has a non-finite {', '.join(bad)}, expected {size} finite numbers")
+        action = self.act(observation, self._first)
+        self._first = False
+        return action
+
+    def episode(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (T, joints) for the observations (T, n) of one episode."""
+        self.reset()
+        return np.stack([self.step(observation) for observation in observations])
+
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
+        """The action for an observation that was checked; ``first``: of an episode."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
 class ExportedNetwork:
     """A user-defined network as an artefact holds it: one compiled step.
@@ -146,7 +192,3 @@ class ExportedNetwork:
     @property
     def size(self) -> int:
         return sum(int(np.prod(shape)) for _, shape in self.shapes)
-
-    def unflatten(self, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """Parameters by name from theta (size,)."""
-        return contract.unflatten(theta, dict(self.shapes))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from importlib import resources
 
 import foxglove.layouts as panels
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import mjx_tt
 from robot_io import log
 from robot_io.calibrated import Frame
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES, LIMITS, PAPER
 from robot_io.log.view import BALL_FRAME, View
 from robot_io.safety.clearance import BLADE, RobotGeometry
 
@@ -47,7 +48,7 @@ def published_class(schema: bytes, name: str):
 @pytest.fixture(scope="module")
 def messages(tmp_path_factory):
     """(schema, log time, message) of each topic of a session; Foxglove's read with its SDK's schemas."""
-    with log.FileRecorder.start(tmp_path_factory.mktemp("view"), "session", {}) as recorder:
+    with log.FileRecorder(tmp_path_factory.mktemp("view"), "session", {}) as recorder:
         for i, pose in enumerate(POSES):
             recorder.put(log.Joints(0.1 * i, pose, np.zeros(8), 0.1 * i + 0.002))
             recorder.put(log.Joints(0.1 * i + 0.004, pose, np.zeros(8)))  # sooner than a frame is due
@@ -166,13 +167,23 @@ def test_a_calibrated_robot_is_drawn_where_the_gate_has_it():
 def test_the_log_of_a_calibrated_robot_draws_it_there(tmp_path):
     places = []
     for name, metadata in (("as_made", {}), ("calibrated", {"robot_base": [[0.02, -0.03, 0.01], [0.0, 0.0, 0.0]]})):
-        with log.FileRecorder.start(tmp_path, name, metadata) as recorder:
+        with log.FileRecorder(tmp_path, name, metadata) as recorder:
             recorder.put(log.Joints(0.0, POSES[0], np.zeros(8)))
         with open(recorder.close(), "rb") as file:
             (_, _, message), *_ = make_reader(file).iter_messages(topics=["/tf"])
         places.append(FrameTransforms.FromString(message.data).transforms[0].translation)
     shift = [getattr(places[1], axis) - getattr(places[0], axis) for axis in "xyz"]
     np.testing.assert_allclose(shift, [0.02, -0.03, 0.01], atol=1e-12)
+
+
+def test_all_that_stands_still_is_one_shape():
+    """Viewers keep one entity of a name."""
+    geometry = json.loads((resources.files("robot_io.safety") / "robot_geometry.json").read_text())
+    first = geometry["capsules"][0]
+    geometry["capsules"] += [first | {"name": name, "joint": "world"} for name in ("post", "foot")]
+    entities = View(robot=replace(PAPER, robot="fixed", geometry=json.dumps(geometry))).scene(0.0).message.entities
+    (world,) = [entity for entity in entities if entity.id == "world"]
+    assert len(world.cylinders) == 2
 
 
 def test_a_view_never_raises_and_skips_what_is_broken():

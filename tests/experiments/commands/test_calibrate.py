@@ -89,7 +89,7 @@ def test_a_calibration_that_run_would_refuse_is_named_and_not_written(measured, 
 def test_the_clock_is_found_with_the_base_that_a_session_was_logged_with(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made, then = made_up(0.031, gap=0.012), Calibration(robot=RobotCalibration((0.0, 0.012, 0.0), date="2026-11-22"))
-    with log.FileRecorder.start(tmp_path, "1", {}, {"calibration.yaml": robots.to_yaml(then)}) as recorder:
+    with log.FileRecorder(tmp_path, "1", {}, {"calibration.yaml": robots.to_yaml(then)}) as recorder:
         records = [log.Joints(t, q, np.zeros(8)) for t, q in zip(made.joints.time, made.joints.position.T, strict=True)]
         ball = made.ball
         for captured, place, number in zip(ball.capture_time, ball.position.T, ball.id, strict=True):

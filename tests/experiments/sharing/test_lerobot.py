@@ -61,7 +61,7 @@ def numbers(tick: int, count: int) -> np.ndarray:
 
 def record(folder, name="monday", reward=True):
     """A session whose episodes have 30 ticks, none, 20 (discarded), and 12 that the log does not see the end of."""
-    with log.FileRecorder.start(folder, name, {"robot": "rig"}, {}, START, EPOCH) as recorder:
+    with log.FileRecorder(folder, name, {"robot": "rig"}, {}, START, EPOCH) as recorder:
         tick, time = 0, START
         for number, ticks in ((1, 30), (2, 0), (3, 20), (4, 12)):
             time += 1.0

@@ -63,7 +63,7 @@ def test_the_extended_model_meets_the_measured_balls_and_the_nominal_one_misses_
 
 def test_a_session_of_the_robot_is_replayed_as_it_was_logged(tmp_path):
     start, home = 50.0, home_qpos(load_model())
-    with log.FileRecorder.start(tmp_path, "session", {}, {}, start, 0) as recorder:
+    with log.FileRecorder(tmp_path, "session", {}, {}, start, 0) as recorder:
         recorder.put(log.episode_start(start + 0.2, 1))
         for k in range(120):
             t, now = k / 75, start + k / 75

@@ -100,12 +100,6 @@ def _forward_by_loops(theta, mean, inverse_scale, history):
     return x[0]
 
 
-def test_parameter_count():
-    assert contract.n_parameters() == 976 == 368 + 408 + 200
-    sizes = [math.prod(shape) for shape in contract.parameter_shapes().values()]
-    assert [sum(sizes[i : i + 2]) for i in (0, 2, 4)] == [368, 408, 200]
-
-
 def test_forward_equals_explicit_loops():
     policy = _policy().astype(np.float64)
     theta, mean, inverse_scale = policy.theta, policy.mean, policy.inv_std
@@ -117,23 +111,6 @@ def test_forward_equals_explicit_loops():
         np.testing.assert_allclose(actions[:, b], expected, atol=1e-13)
         single = policy.apply(histories[:, :, b])
         np.testing.assert_allclose(single, expected, atol=1e-13)
-
-
-@pytest.mark.parametrize(("tap", "seen"), [(1, 7), (0, 0)])
-def test_one_wire_through_the_network_by_hand(tap, seen):
-    # Only ball_z -> filter 5 -> filter 11 -> joint_6 is connected, through one tap: the newer taps see the newest
-    # observation and the older taps the oldest, 1 + 2 + 4 steps back. An idle gate is sigmoid(0) = 1/2.
-    theta = np.zeros(976)
-    parameters = contract.unflatten(theta)  # views
-    parameters["conv1/kernel"][tap, 2, 5] = 1.5
-    parameters["conv2/kernel"][tap, 5, 11] = -2.0
-    parameters["conv3/kernel"][tap, 11, 7] = 3.0
-    history = _histories(1)[:, :, 0]
-    action = Policy(theta, np.full(11, 0.5), np.full(11, 2.0)).apply(history)
-    layer_1 = 0.5 * math.tanh(1.5 * 2.0 * (history[seen, 2] - 0.5))
-    expected = math.tanh(3.0 * 0.5 * math.tanh(-2.0 * layer_1))
-    np.testing.assert_allclose(action, [0, 0, 0, 0, 0, 0, 0, expected], atol=1e-15)
-    assert abs(expected) > 0.05
 
 
 def test_streaming_equals_full_form():
@@ -157,7 +134,7 @@ def test_streaming_refuses_a_bad_observation_and_forgets_it():
         policy.step(good)
     with pytest.raises(ValueError, match="ball_y"):
         disturbed.step(bad)
-    with pytest.raises(ValueError, match=r"\(10,\).*\(11,\)"):
+    with pytest.raises(ValueError, match=r"\(10,\).* 11 finite"):
         disturbed.step(bad[:10])
     np.testing.assert_array_equal(disturbed.step(-good), undisturbed.step(-good))
 
@@ -173,7 +150,7 @@ def test_history_of_another_shape_is_refused():
 
 def test_four_forms_agree_on_1000_histories(exported):
     folder, report = exported
-    assert report["histories"] == 1000 and set(report["from_reference"]) == {"jit", "onnxruntime", "jax_export"}
+    assert set(report["from_reference"]) == {"jit", "onnxruntime", "jax_export"}
     assert report["largest_difference"] <= 1e-5
     assert export.verify(folder, seed=1)["largest_difference"] <= 1e-5
 
@@ -184,9 +161,10 @@ def test_stored_forms_load_without_this_package_and_agree(exported, batch):
     histories = _histories(batch).astype(np.float32)
     expected = _policy().apply(histories)
     onnx_action = onnxruntime.InferenceSession(folder / artefacts.ONNX).run(None, {"history": histories})[0]
-    jax_action = jax.export.deserialize(bytearray((folder / artefacts.JAX_EXPORT).read_bytes())).call(histories)
+    stored = jax.export.deserialize(bytearray((folder / artefacts.JAX_EXPORT).read_bytes()))
+    assert set(stored.platforms) >= {"cpu", "cuda"}
     np.testing.assert_allclose(onnx_action, expected, atol=1e-5)
-    np.testing.assert_allclose(jax_action, expected, atol=1e-5)
+    np.testing.assert_allclose(stored.call(histories), expected, atol=1e-5)
 
 
 def test_the_onnx_file_says_what_its_numbers_are(exported):
@@ -199,11 +177,6 @@ def test_the_onnx_file_says_what_its_numbers_are(exported):
     assert found["action_name"].split(",") == [row["name"] for row in manifest["contract"]["action"]]
     assert [float(x) for x in found["action_scale"].split(",")] == list(contract.LIMITS.policy_velocity)
     assert found["action_unit"].split(",")[0] == "m/s"
-
-
-def test_the_jax_export_runs_on_accelerators_too(exported):
-    stored = jax.export.deserialize(bytearray((exported[0] / artefacts.JAX_EXPORT).read_bytes()))
-    assert set(stored.platforms) >= {"cpu", "cuda"}
 
 
 @pytest.mark.parametrize("made", ["here", "shipped"])
@@ -246,6 +219,7 @@ def test_loaded_artefact_is_what_was_written(exported):
     assert [joint["name"] for joint in loaded.manifest["contract"]["action"]] == list(contract.JOINT_NAMES)
     assert loaded.digest == report["digest"] == hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
     assert sorted(os.listdir(folder)) == sorted(artefacts.FILES)
+    assert (folder / "manifest.sha256").read_text() == f"{loaded.digest}  manifest.json\n"  # as sha256sum has it
     observation = np.linspace(-1, 1, 11)
     constant = np.tile(observation, (8, 1))
     np.testing.assert_allclose(loaded.streaming().step(observation), loaded.policy.apply(constant), atol=1e-12)
@@ -296,12 +270,6 @@ def test_program_in_the_documentation_reproduces_the_golden_outputs(copy):
     subprocess.run(command, cwd=copy, check=True)
     _rewrite_manifest(copy, lambda m: m["normaliser"]["mean"].__setitem__(0, 0.1))
     assert "AssertionError" in subprocess.run(command, cwd=copy, check=False, capture_output=True, text=True).stderr
-
-
-def test_manifest_digest_is_readable_by_sha256sum(exported):
-    folder, _ = exported
-    digest, name = (folder / artefacts.MANIFEST_DIGEST).read_text().split()
-    assert (name, digest) == ("manifest.json", hashlib.sha256((folder / name).read_bytes()).hexdigest())
 
 
 def test_no_folder(tmp_path):

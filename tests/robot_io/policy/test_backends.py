@@ -57,9 +57,9 @@ sys.exit(backend != "numpy" or any(name.startswith("jax.") for name in sys.modul
 
 def test_both_compute_the_same_and_another_policy_does_not_compile_again():
     make_policy("jit", drawn())
-    policy, before = drawn(), jax_policy._forward._cache_size()
+    policy, before = drawn(), jax_policy.jitted_forward._cache_size()
     compiled = make_policy("jit", policy)
-    assert jax_policy._forward._cache_size() == before  # between two balls of a fine-tuning, in the control loop
+    assert jax_policy.jitted_forward._cache_size() == before  # between two balls of a fine-tuning, in the control loop
     plain = make_policy("numpy", policy)
     assert isinstance(compiled, JitPolicy) and isinstance(plain, StreamingPolicy)
     for observation in RANDOM.normal(size=(12, 11)):

@@ -60,7 +60,7 @@ def identified(folder, served, late: float):
     """Parameters that the logs decide, of a robot in rallies."""
     player, policy = VirtualPlayer("player3", 1), load_policy.load(POLICY).policy.astype(np.float32)
     player.prepare()
-    with log.FileRecorder.start(folder, "session", {}, {}, 0.0, 0) as recorder:
+    with log.FileRecorder(folder, "session", {}, {}, 0.0, 0) as recorder:
         rallies = LockStepRallies(player, RigParams(action_delay=late), recorder=recorder)
         hit = sum(rallies.play(policy, k).summary.outcome != "missed" for k in range(PLAYED))
     found = world().hits("player3", folder, folder, "x")
