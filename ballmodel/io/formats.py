@@ -6,12 +6,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from ballmodel.io.aimy import read_aimy
-from ballmodel.io.deepmind import FIELDS, MeasuredStates, read_deepmind
-from ballmodel.io.events import read_events
 from ballmodel.io.messages import read_bag, read_mcap
+from ballmodel.io.published import FIELDS, INDEX, MeasuredStates, read_aimy, read_deepmind, read_events, read_spindoe
 from ballmodel.io.samples import Samples, TrackOptions, make_dataset
-from ballmodel.io.spindoe import INDEX, read_spindoe
 from ballmodel.io.tables import read_table
 from ballmodel.trajectory import Dataset
 
@@ -21,11 +18,7 @@ FORMATS: dict[str, Callable[[Path], Dataset | MeasuredStates]] = {
     "spindoe": read_spindoe,
     "events": lambda path: read_events(path).shots(),
 }
-TRACKS: dict[str, Callable[[Path, TrackOptions], Samples]] = {
-    "csv": read_table,
-    "mcap": read_mcap,
-    "bag": read_bag,
-}
+TRACKS: dict[str, Callable[[Path, TrackOptions], Samples]] = {"csv": read_table, "mcap": read_mcap, "bag": read_bag}
 TABLES = (".csv", ".tsv", ".txt", ".json", ".jsonl", ".ndjson", ".npy", ".npz", ".parquet")
 SUFFIXES = dict.fromkeys(TABLES, "csv") | {".mcap": "mcap", ".bag": "bag", ".hdf5": "aimy", ".h5": "aimy"}
 GUESS = TrackOptions()
