@@ -1,17 +1,18 @@
-"""From measured balls to the human ball distribution: fit, land, drop outliers, take minima and maxima."""
+"""From measured balls to the human ball distribution: a box about those that land without outliers, or a mixture."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
-from ballmodel.distribution import BallDistribution, DistributionReport, fit_distribution
+from ballmodel.distribution import ROWS, BallDistribution, BallMixture
 from ballmodel.flight import BallParams, step
 from ballmodel.initial_state import MIN_SAMPLES, fit_all_nelder_mead, fit_gauss_newton
 from ballmodel.io import MeasuredStates
@@ -20,11 +21,75 @@ from ballmodel.sampling import DT, KEPT, OUTCOMES, OWN_SIDE, ROBOT_SIDE, SECOND_
 from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset, free_flight
 
+EPS_FACTOR = 2.0
 LANDED_TOGETHER = 512  # flights are simulated in multiples of it
 AFTER_BOUNCE = 6  # steps after a serve's bounce on the server's side at which its ball starts: 20 ms
 LONGEST_SERVE = 300  # steps until that bounce
 HALF_TURN = np.array([[-1.0], [-1.0], [1.0]])  # about the table's upright axis
 Fit: TypeAlias = Literal["gauss-newton", "nelder-mead"]
+NUMBERS_OF_COMPONENTS = (1, 2, 3, 5, 8, 12, 16, 24)
+FOLDS = 3
+MOST_BALLS = 4000  # that choose the number of components
+TOLERANCE = 3e-3  # of the mean log likelihood, at which a fit has converged
+FEWEST_EACH = 30  # balls of a component
+REGULARISATION = 1e-3  # of a standardised covariance's diagonal
+LEAST_SPREAD = 1e-9  # in SI units, below which a row does not vary
+
+
+@dataclass(frozen=True)
+class DistributionReport:
+    """Outliers and settings of ``fit_distribution``."""
+
+    n: int  # balls given
+    outlier: Bool[np.ndarray, " n"]  # taken away by DBSCAN
+    eps: float  # DBSCAN radius in robust standard deviations
+    min_samples: int
+
+
+def fit_distribution(
+    states: BallState,
+    landing: Float[np.ndarray, "2 n"],
+    eps: float | None = None,
+    min_samples: int = 5,
+    name: str = "",
+    source: str = "",
+) -> tuple[BallDistribution, DistributionReport]:
+    """Minima and maxima of balls without their outliers.
+
+    states: position [m] and velocity [m/s] of the balls' starts, (3, n); landing: (2, n) [m].
+    A ball is an outlier when DBSCAN puts it into no cluster. Its eight coordinates are first centred on the median and
+    divided by a robust standard deviation (interquartile range / 1.349), so that outliers do not set their own scale.
+    The paper gives neither eps nor min_samples. Without ``eps`` it is EPS_FACTOR times the median distance of a ball
+    to its (min_samples - 1)-th neighbour, after Ester et al. 1996's k-distance, so that it follows the number of balls.
+    Raises ValueError for non-finite input, unequal lengths, fewer than min_samples balls, or when all are outliers.
+    """
+    from sklearn.cluster import DBSCAN  # sklearn takes about a second to import; only this function needs it
+    from sklearn.neighbors import NearestNeighbors
+
+    position, velocity, landing = (np.asarray(a, float) for a in (states.position, states.velocity, landing))
+    points = np.concatenate([position, velocity, landing])
+    if points.shape[0] != 8 or not np.all(np.isfinite(points)):
+        raise ValueError(
+            f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}"
+        )
+    if points.shape[1] < max(min_samples, 2):
+        raise ValueError(f"{points.shape[1]} balls are too few for clusters of min_samples={min_samples}")
+    low, middle, high = np.percentile(points, [25, 50, 75], axis=1, keepdims=True)
+    scale = (high - low) / 1.349
+    standard = (points - middle) / np.where(scale > 0, scale, 1.0)
+    if eps is None:
+        neighbours = NearestNeighbors(n_neighbors=max(min_samples - 1, 1)).fit(standard.T)
+        distances, _ = neighbours.kneighbors()  # of the balls themselves: each one's own distance of zero is left out
+        eps = EPS_FACTOR * float(np.median(distances[:, -1]))
+    outlier = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(standard.T) == -1
+    if np.all(outlier):
+        raise ValueError(
+            f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps"
+        )
+    inside = points[:, ~outlier]
+    low, high = inside.min(axis=1), inside.max(axis=1)
+    distribution = BallDistribution(low[:3], high[:3], low[3:6], high[3:6], low[6:], high[6:], name, source)
+    return distribution, DistributionReport(outlier.size, outlier, eps, min_samples)
 
 
 @dataclass(frozen=True)
@@ -157,3 +222,65 @@ def _replaced(values: np.ndarray, where: np.ndarray, new: np.ndarray) -> np.ndar
     out = np.array(values)
     out[..., where] = new
     return out
+
+
+@dataclass(frozen=True)
+class MixtureReport:
+    """Choice of the number of components."""
+
+    balls: int
+    scores: dict[int, float]  # components -> mean log likelihood of held-out balls, standardised
+
+    @property
+    def chosen(self) -> int:
+        """Number of components under which held-out balls are likeliest."""
+        return max(self.scores, key=lambda k: self.scores[k])
+
+
+def start_states(state: BallState) -> Float[np.ndarray, "n 9"]:
+    """Start states of balls (3, n), a row each."""
+    return np.concatenate([np.asarray(part, np.float64) for part in (state.position, state.velocity, state.spin)]).T
+
+
+def fit_mixture(
+    state: BallState,
+    name: str = "",
+    source: str = "",
+    seed: int = 0,
+    components: Sequence[int] = NUMBERS_OF_COMPONENTS,
+) -> tuple[BallMixture, MixtureReport]:
+    """Mixture of the balls' starts (3, n), with the number of components that held-out balls prefer.
+
+    More components are tried until two in a row do worse. Rows that do not vary (spin, where none is known) stay at
+    their value. Raises ValueError for fewer than FEWEST_EACH balls or numbers that are not finite.
+    """
+    from sklearn.mixture import GaussianMixture  # sklearn takes about a second to import
+    from sklearn.model_selection import KFold, cross_val_score
+
+    rows = start_states(state)
+    if len(rows) < FEWEST_EACH or not np.all(np.isfinite(rows)):
+        raise ValueError(f"{len(rows)} finite start states are too few for a mixture, {FEWEST_EACH} are wanted")
+    varies = np.ptp(rows, axis=0) > LEAST_SPREAD
+    middle, scale = rows.mean(axis=0), np.where(varies, rows.std(axis=0), 1.0)
+    standard = ((rows - middle) / scale)[:, varies]
+
+    def model(k: int, starts: int) -> GaussianMixture:
+        return GaussianMixture(k, reg_covar=REGULARISATION, n_init=starts, random_state=seed, tol=TOLERANCE)
+
+    some = standard[np.random.default_rng(seed).permutation(len(standard))[:MOST_BALLS]]
+    scores: dict[int, float] = {}
+    folds = KFold(FOLDS, shuffle=True, random_state=seed)
+    for k in components:
+        if k > 1 and k * FEWEST_EACH > len(some) * (FOLDS - 1) // FOLDS:
+            break
+        scores[k] = float(np.mean(cross_val_score(model(k, 1), some, cv=folds)))
+        if len(scores) > 2 and max(list(scores.values())[-2:]) < max(scores.values()):
+            break
+    report = MixtureReport(len(rows), scores)
+    fitted = model(report.chosen, 1).fit(standard)
+    chosen = np.flatnonzero(varies)
+    means = np.tile(middle, (report.chosen, 1))
+    means[:, chosen] += fitted.means_ * scale[chosen]
+    covariances = np.zeros((report.chosen, ROWS, ROWS))
+    covariances[:, chosen[:, None], chosen[None]] = fitted.covariances_ * scale[chosen, None] * scale[None, chosen]
+    return BallMixture(fitted.weights_, means, covariances, name, source), report

@@ -29,9 +29,8 @@ from jaxtyping import Bool, Float, Int, Key
 
 from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, elevation, surface_gap
-from ballmodel.distribution import BallDistribution
+from ballmodel.distribution import BallDistribution, BallMixture
 from ballmodel.flight import BallParams, free_step, step
-from ballmodel.mixture import BallMixture
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, ball_state
 from ballmodel.vec import Scalars, Vector
