@@ -203,8 +203,9 @@ class MixtureFile(BallFile):
 
     def build(self, name: str, source: str) -> BallMixture:
         """The mixture; ``name`` and ``source`` stand in for missing ones. Raises ValueError as BallMixture does."""
-        parts = {key: np.array([gaussian[key] for gaussian in self.components]) for key in Gaussian.__annotations__}
-        return BallMixture(parts["weight"], parts["mean"], parts["covariance"], **self.labels(name, source))
+        rows = [(g["weight"], g["mean"], g["covariance"]) for g in self.components]
+        weights, means, covariances = map(np.array, zip(*rows, strict=True))
+        return BallMixture(weights, means, covariances, **self.labels(name, source))
 
 
 def load_distribution(path: str | os.PathLike) -> BallDistribution:

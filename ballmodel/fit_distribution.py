@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.distribution import ROWS, BallDistribution, BallMixture
 from ballmodel.flight import BallParams, step
-from ballmodel.initial_state import MIN_SAMPLES, fit_all_nelder_mead, fit_gauss_newton
+from ballmodel.initial_state import MIN_SAMPLES, fit_gauss_newton, fit_nelder_mead
 from ballmodel.io import MeasuredStates
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import DT, KEPT, OUTCOMES, OWN_SIDE, ROBOT_SIDE, SECOND_BOUNCE, Throw, throw
@@ -123,14 +123,12 @@ def _after_own_bounce(params: BallParams, state: BallState) -> BallState:
     return state
 
 
-def _thrown(params: BallParams, state: BallState) -> tuple[Throw, BallState]:
-    """Flights of balls (3, n), and where serves among them start, in numbers that similar data sets share."""
+def _thrown(params: BallParams, state: BallState) -> Throw:
+    """Flights of balls (3, n), simulated in numbers that similar data sets share."""
     n = state.position.shape[1]
-    padded = jax.tree.map(
-        lambda a: jnp.asarray(np.pad(a, ((0, 0), (0, -n % LANDED_TOGETHER)), mode="edge"), jnp.float32), state
-    )
-    thrown = throw(params, padded, *ROBOT_SIDE)
-    return jax.tree.map(lambda a: np.asarray(a)[..., :n], (thrown, padded))
+    pad = (0, 0), (0, -n % LANDED_TOGETHER)
+    padded = jax.tree.map(lambda a: jnp.asarray(np.pad(a, pad, mode="edge"), jnp.float32), state)
+    return jax.tree.map(lambda a: np.asarray(a)[..., :n], throw(params, padded, *ROBOT_SIDE))
 
 
 def fit_human(
@@ -161,41 +159,41 @@ def fit_human(
     """
     if fit not in get_args(Fit):
         raise ValueError(f"fit {fit!r} is not one of {get_args(Fit)}")
-    if isinstance(measured, Dataset):
+    rms, too_short = np.zeros(0), 0
+    if isinstance(measured, MeasuredStates):
+        if fit == "nelder-mead":
+            raise ValueError(f"{measured.source}: holds start states; {fit} fits trajectories")
+        state, bounced = measured.state, measured.landing
+    else:
         flights = [free_flight(t) for t in measured]
         long_enough = [t for t in flights if len(t) >= MIN_SAMPLES]
-        too_short = len(flights) - len(long_enough)
+        too_short, bounced = len(flights) - len(long_enough), None
         if fit == "nelder-mead":
-            state, rms = fit_all_nelder_mead(long_enough, params.flight, progress)
+            state, rms = fit_nelder_mead(long_enough, params.flight, progress=progress)
         else:
             fitted = fit_gauss_newton(long_enough, params.flight)
             state, rms = fitted.state, fitted.rms
-    elif fit == "nelder-mead":
-        raise ValueError(f"{measured.source}: holds start states; {fit} fits trajectories")
-    else:
-        state, rms, too_short = measured.state, np.zeros(0), 0
     state = jax.tree.map(np.asarray, state)
-    bounced = np.full((2, state.position.shape[1]), np.nan)
-    if isinstance(measured, MeasuredStates) and measured.landing is not None:
-        bounced = measured.landing
+    if bounced is None:
+        bounced = np.full((2, state.position.shape[1]), np.nan)
     if both_players:
         other = (state.position[1] < 0.0) & (state.velocity[1] > 0.0)
         state = jax.tree.map(lambda a: np.where(other, HALF_TURN * a, a), state)
         bounced = np.where(other, -bounced, bounced)
     towards = (state.position[1] > 0.0) & (state.velocity[1] < 0.0)
-    state, bounced = jax.tree.map(lambda a: a[:, towards], state), bounced[:, towards]
+    state, bounced = jax.tree.map(lambda a: a[:, towards], (state, bounced))
     if not towards.any():
         raise ValueError(f"{measured.source}: none of {towards.size} balls flies from the human's side to the robot's")
-    thrown, _ = _thrown(params, state)
-    outcome, landing, served = np.asarray(thrown.outcome), np.asarray(thrown.landing), 0
+    thrown, served = _thrown(params, state), 0
+    outcome, landing = np.asarray(thrown.outcome), np.asarray(thrown.landing)
     own = outcome == OWN_SIDE
     if serves and own.any():
-        _, start = _thrown(params, jax.tree.map(lambda a: a[:, own], state))
+        start = jax.tree.map(lambda a: jnp.asarray(a[:, own], jnp.float32), state)
         start = jax.tree.map(np.asarray, _after_own_bounce(without_nominal(params), start))
-        again, _ = _thrown(params, start)
-        state = jax.tree.map(lambda a, b: _replaced(a, own, b), state, start)
-        landing = _replaced(landing, own, np.asarray(again.landing))
-        outcome = _replaced(outcome, own, np.asarray(again.outcome))
+        again = _thrown(params, start)
+        state, landing, outcome = jax.tree.map(
+            lambda old, new: _replaced(old, own, new), (state, landing, outcome), (start, again.landing, again.outcome)
+        )
         served = int(np.isin(again.outcome, (KEPT, SECOND_BOUNCE)).sum())
     # What was seen to land has landed, whatever a model that is not quite right makes of it.
     there = (np.abs(bounced[0]) < TABLE_WIDTH / 2) & (bounced[1] < 0.0) & (bounced[1] > -TABLE_LENGTH / 2)
@@ -203,17 +201,16 @@ def fit_human(
     outcome = np.where(there & (outcome != SECOND_BOUNCE), KEPT, outcome)
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
-    outcomes = {text: int(count) for text, count in zip(OUTCOMES, counts, strict=True)}
+    outcomes = dict(zip(OUTCOMES, counts.tolist(), strict=True))
     if not good.any():
         hint = "; serves are counted with serves=True" if own.any() and not serves else ""
         raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}{hint}")
-    landed, landing = jax.tree.map(lambda a: a[:, good], state), landing[:, good]
+    landed, landing = jax.tree.map(lambda a: a[:, good], (state, landing))
     distribution, outliers = fit_distribution(landed, landing, eps, min_samples, name, measured.source)
     twice = (outcome == SECOND_BOUNCE)[good] & ~outliers.outlier
     distribution = replace(distribution, short_balls=bool(short_balls and twice.any()))
-    report = HumanReport(
-        len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers, served
-    )
+    elsewhere = int((~towards).sum())
+    report = HumanReport(len(measured), too_short, elsewhere, outcomes, landed, landing, rms, outliers, served)
     return distribution, report
 
 
@@ -247,7 +244,6 @@ def fit_mixture(
     name: str = "",
     source: str = "",
     seed: int = 0,
-    components: Sequence[int] = NUMBERS_OF_COMPONENTS,
 ) -> tuple[BallMixture, MixtureReport]:
     """Mixture of the balls' starts (3, n), with the number of components that held-out balls prefer.
 
@@ -270,7 +266,7 @@ def fit_mixture(
     some = standard[np.random.default_rng(seed).permutation(len(standard))[:MOST_BALLS]]
     scores: dict[int, float] = {}
     folds = KFold(FOLDS, shuffle=True, random_state=seed)
-    for k in components:
+    for k in NUMBERS_OF_COMPONENTS:
         if k > 1 and k * FEWEST_EACH > len(some) * (FOLDS - 1) // FOLDS:
             break
         scores[k] = float(np.mean(cross_val_score(model(k, 1), some, cv=folds)))

@@ -92,7 +92,7 @@ def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Datase
         raise ValueError(f"{source}: expected rows with time and position of a ball, got none among {known.size}")
     scale = _find_length(position[:, kept], options.length or samples.length, notes)
     groups: dict[tuple[str, str], list[int]] = {}
-    for i in kept:
+    for i in kept.tolist():
         groups.setdefault((samples.session[i], samples.track[i]), []).append(i)
     tracks = {}
     for key, found in groups.items():

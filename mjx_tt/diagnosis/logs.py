@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from ballmodel.io.spindoe import INDEX
 
-from ballmodel.io.formats import GUESS, SUFFIXES, read
+from ballmodel.io.formats import GUESS, INDEX, SUFFIXES, read
 from ballmodel.io.samples import TrackOptions
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
