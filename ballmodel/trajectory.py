@@ -82,6 +82,11 @@ class Dataset:
     def __iter__(self) -> Iterator[Trajectory]:
         return iter(self.trajectories)
 
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """Session names in the order of their first trajectory."""
+        return tuple(dict.fromkeys(t.session for t in self.trajectories))
+
 
 def first_bounce(trajectory: Trajectory) -> int | None:
     """Index of the lowest sample at the first bounce, or None where the ball does not bounce.

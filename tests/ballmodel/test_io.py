@@ -77,6 +77,7 @@ def test_csv_groups_rows_into_trajectories(tmp_path):
     path.write_text(GOOD)
     data = read(path)
     assert [(t.session, t.name, len(t)) for t in data] == [("mon", "1", 2), ("mon", "2", 1)]
+    assert data.sessions == ("mon",)
     np.testing.assert_array_equal(data.trajectories[0].position, [[0.1, 0.1], [1.2, 1.15], [0.3, 0.31]])
     path.write_text("\ufefftrajectory,t,x,y,z\n1,0,0,1,0.2\n", encoding="utf-8")
     assert read(path).trajectories[0].session == ""
@@ -174,7 +175,7 @@ def test_deepmind_states():
 def test_aimy_balls_fly_to_the_robot_and_bounce_on_its_half():
     for session, count in (("mn5008_topspin", 15), ("no_spin_robot_simple", 48)):
         data = read(MEASURED / "aimy_launcher" / f"{session}.hdf5")
-        assert (len(data), {t.session for t in data}) == (count, {session})
+        assert (len(data), data.sessions) == (count, (session,))
         # Two recordings end some 20 mm above the table, before the bounce.
         cut_short = {"9", "14"} if session == "mn5008_topspin" else set()
         assert {t.name for t in data if first_bounce(t) is None} == cut_short
