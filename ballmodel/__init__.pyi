@@ -1,15 +1,14 @@
 from .aerodynamics import FlightParams as FlightParams
 from .distribution import BallDistribution as BallDistribution
+from .distribution import BallMixture as BallMixture
 from .distribution import load_distribution as load_distribution
 from .distribution import save_distribution as save_distribution
 from .fit_distribution import fit_human as fit_human
+from .fit_distribution import fit_mixture as fit_mixture
 from .flight import BallParams as BallParams
 from .flight import step as step
 from .initial_state import fit_gauss_newton as fit_gauss_newton
 from .initial_state import fit_nelder_mead as fit_nelder_mead
-from .mixture import BallMixture as BallMixture
-from .mixture import fit_mixture as fit_mixture
-from .mixture import save_mixture as save_mixture
 from .registry import names as names
 from .registry import resolve as resolve
 from .sampling import BallPool as BallPool

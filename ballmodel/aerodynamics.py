@@ -40,9 +40,8 @@ class FlightParams:
     mass: Annotated[Scalars, Within(0.0001, 0.1, "kg")] = c.BALL_MASS  # [kg]
     radius: Annotated[Scalars, Within(0.001, 0.1, "m")] = c.BALL_RADIUS  # [m]
     area: Annotated[Scalars, Within(1e-06, 0.1, "m^2")] = c.BALL_AREA  # [m^2] cross-section
-    buoyancy: Annotated[Scalars, Within(-10.0, 10.0)] = (
-        0.0  # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
-    )
+    # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
+    buoyancy: Annotated[Scalars, Within(-10.0, 10.0)] = 0.0
     gravity_x: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = 0.0  # [m/s^2]
     gravity_y: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = 0.0  # [m/s^2]
     gravity_z: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = -c.GRAVITY  # [m/s^2]

@@ -13,7 +13,6 @@ Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -77,75 +76,45 @@ def restitution_at(params: SurfaceParams | PaddleParams, normal_speed: Scalars) 
     return jnp.clip(params.restitution - params.restitution_slope * jnp.abs(normal_speed), 0.0, 1.0)
 
 
-def _apply(
+def impact(
+    params: SurfaceParams | PaddleParams,
     velocity: Vector,
     spin: Vector,
     normal: Vector,
-    surface_velocity: Vector,
     radius: Scalars,
-    restitution: Callable[[Scalars], Scalars],
-    alpha_of: Callable[[Scalars, Scalars, Scalars], Scalars],
+    surface_velocity: Vector = (0.0, 0.0, 0.0),
+    off_centre: Scalars = 0.0,
 ) -> tuple[Vec, Vec]:
+    """Velocity and spin after an impact on table or net, or on the paddle. Vectors are Vecs or (3, ...) arrays.
+
+    Args:
+        params: of the surface.
+        velocity, spin: of the ball [m/s], [rad/s].
+        normal: unit vector pointing to the ball.
+        radius: of the ball [m].
+        surface_velocity: [m/s] of the contact point, which it keeps: the arm is so much heavier than the ball (60 kg to
+            2.7 g).
+        off_centre: square of the contact's distance from the blade's centre over that of the rim.
+    """
     velocity, spin, normal = components(velocity), components(spin), components(normal)
     relative = velocity - surface_velocity
     normal_speed = dot(relative, normal)
     contact_arm = normal * -radius
     slip = relative - normal * normal_speed + cross(spin, contact_arm)
     slip = slip - normal * dot(slip, normal)
-    e = restitution(normal_speed)
-    tangential = slip * -alpha_of(e, normal_speed, norm(slip))
+    e: Scalars = restitution_at(params, normal_speed)
+    if isinstance(params, PaddleParams):
+        alpha: Scalars = params.tangential_gain
+        if params.rim_loss is not None:
+            e = e * (1.0 - params.rim_loss * off_centre)
+    else:
+        e_t = params.tangential_restitution
+        sliding = params.friction * (1.0 + e) * jnp.abs(normal_speed) / (norm(slip) + TINY)
+        alpha = jnp.minimum(sliding, STICKING if e_t is None else STICKING * (1.0 + e_t))
+    tangential = slip * -alpha
     new_velocity = velocity - normal * ((1.0 + e) * normal_speed) + tangential
     new_spin = spin - cross(normal, tangential) / (c.SHELL_INERTIA_FACTOR * radius)
     return new_velocity, new_spin
-
-
-def surface_impact(
-    params: SurfaceParams, velocity: Vector, spin: Vector, normal: Vector, radius: Scalars
-) -> tuple[Vec, Vec]:
-    """Velocity and spin after an impact on a resting surface.
-
-    velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs or (3, ...) arrays; radius [m].
-    """
-
-    e_t = params.tangential_restitution
-    gripping = STICKING if e_t is None else STICKING * (1.0 + e_t)
-
-    def alpha_of(e: Scalars, normal_speed: Scalars, slip_speed: Scalars) -> jax.Array:
-        return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), gripping)
-
-    return _apply(velocity, spin, normal, (0.0, 0.0, 0.0), radius, lambda s: restitution_at(params, s), alpha_of)
-
-
-def paddle_impact(
-    params: PaddleParams,
-    velocity: Vector,
-    spin: Vector,
-    normal: Vector,
-    paddle_velocity: Vector,
-    radius: Scalars,
-    off_centre: Scalars = 0.0,
-) -> tuple[Vec, Vec]:
-    """Velocity and spin after an impact on the moving paddle.
-
-    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are
-    Vecs or (3, ...) arrays; radius [m]. off_centre: square of the contact's distance from the blade's centre over that
-    of the rim.
-    The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
-    """
-
-    def restitution(normal_speed: Scalars) -> Scalars:
-        e = restitution_at(params, normal_speed)
-        return e if params.rim_loss is None else e * (1.0 - params.rim_loss * off_centre)
-
-    return _apply(
-        velocity,
-        spin,
-        normal,
-        paddle_velocity,
-        radius,
-        restitution,
-        lambda e, normal_speed, slip_speed: params.tangential_gain,
-    )
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
-"""The human ball distribution: 16 numbers that bound where balls start, how fast, and where they land.
+"""Where and how people's balls start: a box of 16 numbers, or a Gaussian mixture of start states.
 
-Abeyruwan et al. 2022, "Modeling Human Ball Distributions": the minima and maxima of initial position (6), initial
-velocity (6) and landing x and y on the robot's side (4), after DBSCAN took the outliers away. Velocities are signed
-and in the table frame, so a ball towards the robot has vy < 0.
+The box is Abeyruwan et al. 2022's, "Modeling Human Ball Distributions": minima and maxima of initial position (6),
+initial velocity (6) and landing x and y on the robot's side (4), signed and in the table frame, so a ball towards the
+robot has vy < 0. A box knows no correlation and fills its corners: half of its balls are unlike every ball that the
+person played. The mixture keeps them.
 """
 
 from __future__ import annotations
@@ -14,16 +15,18 @@ from typing import Annotated, Any
 
 import numpy as np
 import yaml
-from jaxtyping import Bool, Float
-from pydantic import BeforeValidator
+from jaxtyping import Float
+from pydantic import BeforeValidator, Field
+from typing_extensions import TypedDict
 
+from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
+from ballmodel.io import validation
 from ballmodel.io.atomic_files import replacing
-from ballmodel.io.validation import Finite, Increasing, Section, validate
-from ballmodel.io.yaml import read as read_yaml
-from ballmodel.state import BallState
+from ballmodel.io.ranges import Within
+from ballmodel.io.validation import Finite, Increasing, Section
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
-EPS_FACTOR = 2.0
+ROWS = 9  # numbers of a start state: position [m], velocity [m/s], spin [rad/s]
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class BallDistribution:
 
     def __post_init__(self) -> None:
         for part, axes in AXES.items():
-            low, high = (tuple(float(v) for v in getattr(self, f"{part}_{end}")) for end in ("min", "max"))
+            low, high = (tuple(map(float, end)) for end in self._ends(part))
             if not len(low) == len(high) == len(axes):
                 raise ValueError(f"{self.name}: {part}: expected {len(axes)} numbers at each end, got {low}, {high}")
             for axis, a, b in zip(axes, low, high, strict=True):
@@ -57,40 +60,98 @@ class BallDistribution:
     def to_dict(self) -> dict:
         """The YAML form: position, velocity and landing as {axis: [min, max]}."""
         intervals = {
-            part: {
-                axis: [low, high]
-                for axis, low, high in zip(
-                    axes, getattr(self, f"{part}_min"), getattr(self, f"{part}_max"), strict=True
-                )
-            }
+            part: {axis: [low, high] for axis, low, high in zip(axes, *self._ends(part), strict=True)}
             for part, axes in AXES.items()
         }
-        short = {"short_balls": True} if self.short_balls else {}
-        return {"name": self.name, "source": self.source, **intervals, **short}
+        return {"name": self.name, "source": self.source, **intervals, **_short(self.short_balls)}
+
+    def _ends(self, part: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return getattr(self, f"{part}_min"), getattr(self, f"{part}_max")
+
+
+@dataclass(frozen=True, eq=False)
+class BallMixture:
+    """Gaussian components over start states; ``name`` and ``source`` tell their origin.
+
+    Raises ValueError for shapes that do not match, weights that are no shares, and covariances that are none.
+    """
+
+    weights: Float[np.ndarray, " k"]
+    means: Float[np.ndarray, "k 9"]  # position [m], velocity [m/s], spin [rad/s]
+    covariances: Float[np.ndarray, "k 9 9"]
+    name: str = ""
+    source: str = ""
+    short_balls: bool = False  # as of a BallDistribution
+
+    def __post_init__(self) -> None:
+        weights, means, covariances = (
+            np.asarray(getattr(self, part), np.float64) for part in ("weights", "means", "covariances")
+        )
+        k, shapes = weights.size, (weights.shape, means.shape, covariances.shape)
+        if not k or shapes != ((k,), (k, ROWS), (k, ROWS, ROWS)):
+            wanted = f"weights (k,), means (k, {ROWS}) and covariances (k, {ROWS}, {ROWS})"
+            raise ValueError(f"{self.name}: expected {wanted}, got {', '.join(map(str, shapes))}")
+        if not all(np.all(np.isfinite(part)) for part in (weights, means, covariances)):
+            raise ValueError(f"{self.name}: expected finite numbers")
+        if np.any(weights < 0.0) or abs(weights.sum() - 1.0) > 1e-3:
+            raise ValueError(f"{self.name}: weights: expected shares that sum to 1, got {weights.tolist()}")
+        for i, covariance in enumerate(covariances):
+            size = np.abs(covariance).max()
+            symmetric = np.allclose(covariance, covariance.T, atol=1e-6 * size)
+            if not symmetric or np.linalg.eigvalsh(covariance)[0] < -1e-5 * size:
+                where = f"{self.name}: covariance of component {i}"
+                raise ValueError(f"{where}: expected symmetry and no negative eigenvalues")
+        for part, value in (("weights", weights / weights.sum()), ("means", means), ("covariances", covariances)):
+            object.__setattr__(self, part, value)
+
+    @property
+    def factors(self) -> Float[np.ndarray, "k 9 9"]:
+        """Matrices F with F F^T = covariance."""
+        values, vectors = np.linalg.eigh(self.covariances)
+        return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+
+    @property
+    def box(self) -> BallDistribution:
+        """Bounds: three standard deviations about the components' means, and the robot's half of the table."""
+        spread = 3.0 * np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        low, high = (ends.tolist() for ends in ((self.means - spread).min(axis=0), (self.means + spread).max(axis=0)))
+        ends = low[:3], high[:3], low[3:6], high[3:6], (-TABLE_WIDTH / 2, -TABLE_LENGTH / 2), (TABLE_WIDTH / 2, 0.0)
+        return BallDistribution(*ends, self.name, self.source, self.short_balls)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The YAML form."""
+        components = [
+            {"weight": float(w), "mean": m.tolist(), "covariance": c.tolist()}
+            for w, m, c in zip(self.weights, self.means, self.covariances, strict=True)
+        ]
+        return {"name": self.name, "source": self.source, **_short(self.short_balls), "components": components}
+
+
+def _short(short_balls: bool) -> dict[str, bool]:
+    return {"short_balls": True} if short_balls else {}
 
 
 Interval = Annotated[tuple[Finite, Finite], Increasing]
-Text = Annotated[str, BeforeValidator(str)]
 
 
-class Space(Section):
-    """Ends of a quantity in space."""
-
+class Space(TypedDict):
     x: Interval
-    """[min, max]."""
     y: Interval
-    """[min, max]."""
     z: Interval
-    """[min, max]."""
 
 
-class Plane(Section):
-    """Ends of a place on the table."""
-
+class Plane(TypedDict):
     x: Interval
-    """[min, max] in m."""
     y: Interval
-    """[min, max] in m."""
+
+
+class Gaussian(TypedDict):
+    weight: Annotated[float, Within(0.0)]
+    mean: list[Finite]
+    covariance: list[list[Finite]]
+
+
+Text = Annotated[str, BeforeValidator(str)]
 
 
 class BallFile(Section):
@@ -122,85 +183,38 @@ class BoxFile(BallFile):
     velocity: Space
     """[m/s] at the start."""
     landing: Plane
-    """Where the ball first bounces."""
+    """[m] where the ball first bounces."""
 
-    def box(self, name: str, source: str) -> BallDistribution:
+    def build(self, name: str, source: str) -> BallDistribution:
         """The box; ``name`` and ``source`` stand in for missing ones."""
         ends: dict[str, Any] = {
-            f"{part}_{end}": tuple(getattr(getattr(self, part), axis)[i] for axis in axes)
+            f"{part}_{end}": [getattr(self, part)[axis][i] for axis in axes]
             for part, axes in AXES.items()
             for i, end in enumerate(("min", "max"))
         }
         return BallDistribution(**ends, **self.labels(name, source))
 
 
-def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
-    """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    return validate(BoxFile, data, where).box(name, source)
+class MixtureFile(BallFile):
+    """The YAML of a mixture."""
+
+    components: Annotated[list[Gaussian], Field(min_length=1)]
+    """The Gaussians: share of the balls, nine numbers (position [m], velocity [m/s], spin [rad/s]), nine times nine."""
+
+    def build(self, name: str, source: str) -> BallMixture:
+        """The mixture; ``name`` and ``source`` stand in for missing ones. Raises ValueError as BallMixture does."""
+        rows = [(g["weight"], g["mean"], g["covariance"]) for g in self.components]
+        weights, means, covariances = map(np.array, zip(*rows, strict=True))
+        return BallMixture(weights, means, covariances, **self.labels(name, source))
 
 
 def load_distribution(path: str | os.PathLike) -> BallDistribution:
     """Reads one distribution from YAML. Raises ValueError naming file, key, what was given and what is allowed."""
-    return parse_distribution(read_yaml(path), str(path), name=Path(path).stem)
+    return validation.read(BoxFile, path).build(Path(path).stem, "")
 
 
-def save_distribution(path: str | os.PathLike, distribution: BallDistribution) -> None:
-    """Writes the distribution as YAML; an existing file is replaced only by a complete one."""
+def save_distribution(path: str | os.PathLike, balls: BallDistribution | BallMixture) -> None:
+    """Writes a distribution or a mixture as YAML; an existing file is replaced only by a complete one."""
     with replacing(path) as temporary:
-        temporary.write_text(yaml.safe_dump(distribution.to_dict(), sort_keys=False), encoding="utf-8")
-
-
-@dataclass(frozen=True)
-class DistributionReport:
-    """Outliers and settings of ``fit_distribution``."""
-
-    n: int  # balls given
-    outlier: Bool[np.ndarray, " n"]  # taken away by DBSCAN
-    eps: float  # DBSCAN radius in robust standard deviations
-    min_samples: int
-
-
-def fit_distribution(
-    states: BallState,
-    landing: Float[np.ndarray, "2 n"],
-    eps: float | None = None,
-    min_samples: int = 5,
-    name: str = "",
-    source: str = "",
-) -> tuple[BallDistribution, DistributionReport]:
-    """Minima and maxima of balls without their outliers.
-
-    states: position [m] and velocity [m/s] of the balls' starts, (3, n); landing: (2, n) [m].
-    A ball is an outlier when DBSCAN puts it into no cluster. Its eight coordinates are first centred on the median and
-    divided by a robust standard deviation (interquartile range / 1.349), so that outliers do not set their own scale.
-    The paper gives neither eps nor min_samples. Without ``eps`` it is EPS_FACTOR times the median distance of a ball
-    to its (min_samples - 1)-th neighbour, after Ester et al. 1996's k-distance, so that it follows the number of balls.
-    Raises ValueError for non-finite input, unequal lengths, fewer than min_samples balls, or when all are outliers.
-    """
-    from sklearn.cluster import DBSCAN  # sklearn takes about a second to import; only this function needs it
-    from sklearn.neighbors import NearestNeighbors
-
-    position, velocity, landing = (np.asarray(a, float) for a in (states.position, states.velocity, landing))
-    points = np.concatenate([position, velocity, landing])
-    if points.shape[0] != 8 or not np.all(np.isfinite(points)):
-        raise ValueError(
-            f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}"
-        )
-    if points.shape[1] < max(min_samples, 2):
-        raise ValueError(f"{points.shape[1]} balls are too few for clusters of min_samples={min_samples}")
-    low, middle, high = np.percentile(points, [25, 50, 75], axis=1, keepdims=True)
-    scale = (high - low) / 1.349
-    standard = (points - middle) / np.where(scale > 0, scale, 1.0)
-    if eps is None:
-        neighbours = NearestNeighbors(n_neighbors=max(min_samples - 1, 1)).fit(standard.T)
-        distances, _ = neighbours.kneighbors()  # of the balls themselves: each one's own distance of zero is left out
-        eps = EPS_FACTOR * float(np.median(distances[:, -1]))
-    outlier = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(standard.T) == -1
-    if np.all(outlier):
-        raise ValueError(
-            f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps"
-        )
-    inside = points[:, ~outlier]
-    low, high = inside.min(axis=1), inside.max(axis=1)
-    distribution = BallDistribution(low[:3], high[:3], low[3:6], high[3:6], low[6:], high[6:], name, source)
-    return distribution, DistributionReport(outlier.size, outlier, eps, min_samples)
+        width = 200 if isinstance(balls, BallMixture) else 80
+        temporary.write_text(yaml.safe_dump(balls.to_dict(), sort_keys=False, width=width), encoding="utf-8")

@@ -86,11 +86,6 @@ def _ball(state: BallState) -> _Ball:
     return _Ball(components(state.position), components(state.velocity), components(state.spin))
 
 
-def _blade(pose: PaddlePose) -> _Blade:
-    vectors = (pose.position, pose.normal, pose.velocity, pose.angular_velocity)
-    return _Blade(*(components(vector) for vector in vectors))
-
-
 def free_step(params: FlightParams, state: BallState, dt: Scalars) -> BallState:
     """One step of free flight over ``dt`` [s], a scalar or of the batch shape."""
     return _stacked(_free_step(params, _ball(state), dt))
@@ -168,15 +163,16 @@ def _mix(start: Vec, end: Vec, w: Scalars) -> Vec:
     return start * (1.0 - w) + end * w
 
 
-def _mounted(params: PaddleParams, pose: _Blade) -> _Blade:
+def _mounted(params: PaddleParams, pose: PaddlePose) -> _Blade:
     """The pose of the blade as it is mounted: turned and shifted from where the kinematics has it.
 
     The axis of the turn is horizontal and in the blade, z x n / |z x n|; a blade that lies flat has no such axis and is
     not turned.
     """
+    blade = _Blade(*map(components, (pose.position, pose.normal, pose.velocity, pose.angular_velocity)))
     if params.tilt is None and params.offset is None:
-        return pose
-    n, tilt = pose.normal, value_or(params.tilt, 0.0)
+        return blade
+    n, tilt = blade.normal, value_or(params.tilt, 0.0)
     # The in-plane direction that the normal turns to, axis x n = (n_z n - z) / |z x n|: down along the blade.
     flat = jnp.sqrt(jnp.maximum(n[0] * n[0] + n[1] * n[1], 1e-12))
     down = Vec(n[2] * n[0] / flat, n[2] * n[1] / flat, -flat)
@@ -184,8 +180,8 @@ def _mounted(params: PaddleParams, pose: _Blade) -> _Blade:
     cos, sin = jnp.where(lies, 1.0, jnp.cos(tilt)), jnp.where(lies, 0.0, jnp.sin(tilt))
     normal = Vec(*(n[i] * cos + down[i] * sin for i in range(3)))
     shift = normal * value_or(params.offset, 0.0)
-    velocity = pose.velocity + cross(pose.angular_velocity, shift)
-    return optimization_barrier(_Blade(pose.position + shift, normal, velocity, pose.angular_velocity))
+    velocity = blade.velocity + cross(blade.angular_velocity, shift)
+    return optimization_barrier(_Blade(blade.position + shift, normal, velocity, blade.angular_velocity))
 
 
 def _paddle_time(
@@ -228,7 +224,7 @@ def step(
     if with_net:
         t_first = jnp.minimum(t_table, _box_time(NET, params.net, ball, a, free.position, radius, dt))
     if paddle is not None:
-        start, end = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
+        start, end = (_mounted(params.paddle, pose) for pose in paddle)
         t_paddle, side = _paddle_time(params.paddle, radius, ball, free.position, start, end, dt)
         t_first = jnp.minimum(t_first, t_paddle)
     hit_any = t_first <= dt
@@ -253,7 +249,7 @@ def step(
             either["tangential_restitution"] = jnp.where(hit_table, value_or(grips[0], 0.0), value_or(grips[1], 0.0))
         surface = replace(params.table, **either)
     normal = optimization_barrier(normal)
-    velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
+    velocity, spin = contact.impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
         w = t / dt
         blade_normal = _mix(start.normal, end.normal, w) * side
@@ -267,8 +263,8 @@ def step(
         if params.paddle.rim_loss is not None:
             along = dot(arm, blade_normal)
             off_centre = (dot(arm, arm) - along * along) / (params.paddle.radius * params.paddle.radius)
-        v_paddle, w_paddle = contact.paddle_impact(
-            params.paddle, at.velocity, at.spin, blade_normal, blade_velocity, radius, off_centre
+        v_paddle, w_paddle = contact.impact(
+            params.paddle, at.velocity, at.spin, blade_normal, radius, blade_velocity, off_centre
         )
         velocity = select(hit_paddle, v_paddle, velocity)
         spin = select(hit_paddle, w_paddle, spin)
@@ -291,6 +287,6 @@ def touched(
     end: position [m] to which it would otherwise go from ``state`` in ``dt`` [s]
     paddle: pose at the step's start, pose at its end
     """
-    first, last = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
+    first, last = (_mounted(params.paddle, pose) for pose in paddle)
     t, _ = _paddle_time(params.paddle, params.flight.radius, _ball(state), components(end), first, last, dt)
     return t <= dt

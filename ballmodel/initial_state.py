@@ -36,6 +36,10 @@ MANY, PAD_MANY = 256, 512  # and more than MANY trajectories to this
 MAX_ITERATIONS = 50
 STEP_TOLERANCE = 1e-9  # [m], [m/s] change below which a fit has converged
 
+NELDER_MEAD = {"xatol": 1e-7, "fatol": 1e-10, "maxiter": 5000, "maxfev": 10000}
+# The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
+SIMPLEX = np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
+
 
 @dataclass(frozen=True)
 class FitResult:
@@ -58,15 +62,20 @@ class _Measured:
     mask: Float[Array, "T n"]  # 1 for a sample, 0 for padding
 
 
-def _check(trajectories: Sequence[Trajectory]) -> None:
+def _check(trajectories: Sequence[Trajectory], spin: ArrayLike | None) -> Float[np.ndarray, "3 n"]:
+    """The spins of flights that are long enough."""
     if not trajectories:
         raise ValueError("no trajectory to fit")
-    short = [t for t in trajectories if len(t) < MIN_SAMPLES]
+    n, short = len(trajectories), [t for t in trajectories if len(t) < MIN_SAMPLES]
     if short:
         raise ValueError(
-            f"{len(short)} of {len(trajectories)} trajectories have fewer than {MIN_SAMPLES} samples of free flight, "
+            f"{len(short)} of {n} trajectories have fewer than {MIN_SAMPLES} samples of free flight, "
             f"the first is {short[0].label} with {len(short[0])}"
         )
+    spins = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
+    if spins.shape != (3, n):
+        raise ValueError(f"spin has shape {spins.shape}, (3, {n}) is wanted: one spin for each trajectory")
+    return spins
 
 
 def _pad(
@@ -156,54 +165,37 @@ def _levenberg_marquardt(
     measured: _Measured,
     huber: float | None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    linearise = partial(_linearise, flight, measured=measured, huber=huber)
+    def linearise(x0: Array, v0: Array) -> tuple[Array, ...]:
+        return x0, v0, *_linearise(flight, x0, v0, measured, huber)
 
-    def unfinished(carry: dict[str, Array]) -> Array:
-        return (carry["iteration"] < MAX_ITERATIONS) & ~jnp.all(carry["converged"])
+    def unfinished(carry: tuple) -> Array:
+        *_, converged, iteration = carry
+        return (iteration < MAX_ITERATIONS) & ~jnp.all(converged)
 
-    def iterate(carry: dict[str, Array]) -> dict[str, Array]:
-        diagonal = jnp.diagonal(carry["normal"], axis1=1, axis2=2)
-        damped = carry["normal"] + carry["damping"][:, None, None] * diagonal[:, :, None] * jnp.eye(6)[None]
-        change = jnp.linalg.solve(damped, carry["right"][..., None])[..., 0]
-        x_new, v_new = carry["x0"] + change[:, :3].T, carry["v0"] + change[:, 3:].T
-        cost, normal, right = linearise(x_new, v_new)
-        better = (cost <= carry["cost"]) & ~carry["converged"]
+    def iterate(carry: tuple) -> tuple:
+        (x0, v0, cost, normal, right), damping, converged, iteration = carry
+        diagonal = jnp.diagonal(normal, axis1=1, axis2=2)
+        damped = normal + damping[:, None, None] * diagonal[:, :, None] * jnp.eye(6)[None]
+        change = jnp.linalg.solve(damped, right[..., None])[..., 0]
+        new = linearise(x0 + change[:, :3].T, v0 + change[:, 3:].T)
+        better = (new[2] <= cost) & ~converged
+        masks = better, better, better, better[:, None, None], better[:, None]
+        picked = tuple(jnp.where(mask, a, b) for mask, a, b in zip(masks, new, carry[0], strict=True))
         small = jnp.max(jnp.abs(change), axis=1) < STEP_TOLERANCE
+        damping = jnp.where(better, damping * 0.1, damping * 10.0)
+        return picked, damping, converged | small, iteration + 1
 
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(better.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-
-        return {
-            "x0": jnp.where(better, x_new, carry["x0"]),
-            "v0": jnp.where(better, v_new, carry["v0"]),
-            "cost": pick(cost, carry["cost"]),
-            "normal": pick(normal, carry["normal"]),
-            "right": pick(right, carry["right"]),
-            "damping": jnp.where(better, carry["damping"] * 0.1, carry["damping"] * 10.0),
-            "converged": carry["converged"] | small,
-            "iteration": carry["iteration"] + 1,
-        }
-
-    cost, normal, right = linearise(x0, v0)
-    carry = {
-        "x0": x0,
-        "v0": v0,
-        "cost": cost,
-        "normal": normal,
-        "right": right,
-        "damping": jnp.full_like(cost, 1e-6),
-        "converged": cost < 0.0,
-        "iteration": jnp.zeros((), jnp.int32),
-    }
-    carry = jax.lax.while_loop(unfinished, iterate, carry)
-    x0, v0 = carry["x0"], carry["v0"]
+    start = linearise(x0, v0)
+    cost = start[2]
+    carry = (start, jnp.full_like(cost, 1e-6), cost < 0.0, jnp.zeros((), jnp.int32))
+    (x0, v0, _, normal, _), _, converged, _ = jax.lax.while_loop(unfinished, iterate, carry)
     residual, mask = measured.position - _shape(flight, v0, measured) - x0[:, None], measured.mask
     square = jnp.sum(residual * residual, axis=0)
     samples = jnp.sum(mask, axis=0)
     rms = jnp.sqrt(jnp.sum(mask * square, axis=0) / samples)
     spread = jnp.sum(_weights(jnp.sqrt(square), mask, huber) * square, axis=0) / (3.0 * samples - 6.0)
-    covariance = jnp.moveaxis(jnp.linalg.inv(carry["normal"]), 0, -1) * spread[None, None]
-    return x0, v0, rms, covariance, carry["converged"]
+    covariance = jnp.moveaxis(jnp.linalg.inv(normal), 0, -1) * spread[None, None]
+    return x0, v0, rms, covariance, converged
 
 
 def fit_gauss_newton(
@@ -220,18 +212,15 @@ def fit_gauss_newton(
     Compiles once for each padded number of trajectories and samples and each number of steps between samples.
     Raises ValueError for too few samples or a spin of the wrong shape.
     """
-    _check(trajectories)
+    spins = _check(trajectories, spin)
     n = len(trajectories)
     extra = -n % (PAD if n <= MANY else PAD_MANY)
-    spin = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
-    if spin.shape != (3, n):
-        raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
-    spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
+    padded = np.pad(spins, ((0, 0), (0, extra)), mode="edge")
     with jax.enable_x64(True):
-        measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
+        measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], padded)
         result = _levenberg_marquardt(without_nominal(flight), x0, v0, measured, huber)
         x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
-    return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
+    return FitResult(BallState(x0, v0, spins), rms, covariance, converged)
 
 
 @jax.jit
@@ -242,44 +231,26 @@ def _rms_distance(unknowns: Float[Array, "6"], flight: FlightParams, measured: _
 
 
 def fit_nelder_mead(
-    trajectory: Trajectory, flight: FlightParams, spin: ArrayLike | None = None
-) -> tuple[BallState, float]:
-    """The paper's fit of one free flight: state, (3,), at the first sample and root mean square distance [m].
-
-    spin: (3,) [rad/s], zero without it. Raises ValueError when there are fewer than MIN_SAMPLES samples.
-    """
-    _check([trajectory])
-    spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
-    with jax.enable_x64(True):
-        measured, *guess = _pad([trajectory], spin[:, None])
-    start = np.concatenate(guess)[:, 0]
-    # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
-    simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
-    nominal = without_nominal(flight)
-    with jax.enable_x64(True):
-        result = minimize(
-            lambda unknowns: float(_rms_distance(unknowns, nominal, measured)),
-            start,
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-10, "maxiter": 5000, "maxfev": 10000},
-        )
-    return BallState(result.x[:3], result.x[3:], spin), float(result.fun)
-
-
-def fit_all_nelder_mead(
-    trajectories: Sequence[Trajectory], flight: FlightParams, progress: Callable[[int, int], None] | None = None
+    trajectories: Sequence[Trajectory],
+    flight: FlightParams,
+    spin: ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[BallState, Float[np.ndarray, " n"]]:
-    """The paper's fit of flights without spin, one after the other: states (3, n) and root mean square distances [m].
+    """The paper's fit, one flight after the other: states (3, n) at the first samples, root mean square distances [m].
 
-    A flight takes about a tenth of a second. progress: called with (fitted so far, n) after each one.
-    Raises ValueError as ``fit_gauss_newton`` does.
+    trajectories, spin: as of ``fit_gauss_newton``, which also raises the same errors.
+    progress: called with (fitted so far, n) after each flight, which takes about a tenth of a second.
     """
-    _check(trajectories)
-    states, rms = [], []
-    for i, trajectory in enumerate(trajectories):
-        state, distance = fit_nelder_mead(trajectory, flight)
-        states.append(state)
-        rms.append(distance)
-        if progress is not None:
-            progress(i + 1, len(trajectories))
-    return jax.tree.map(lambda *components: np.stack(components, axis=-1), *states), np.array(rms)
+    spins = _check(trajectories, spin)
+    nominal, found = without_nominal(flight), []
+    with jax.enable_x64(True):
+        for i, trajectory in enumerate(trajectories):
+            measured, *guess = _pad([trajectory], spins[:, i : i + 1])
+            start = np.concatenate(guess)[:, 0]
+            options = NELDER_MEAD | {"initial_simplex": start + SIMPLEX}
+            result = minimize(_rms_distance, start, (nominal, measured), method="Nelder-Mead", options=options)
+            found.append([*result.x, result.fun])
+            if progress is not None:
+                progress(i + 1, len(trajectories))
+    table = np.array(found).T
+    return BallState(table[:3], table[3:6], spins), table[6]

@@ -1,7 +1,4 @@
-"""Finds the paper's distributions by name: ``player1/M0`` to ``player5/M2``, large, medium, narrow, s2r-oracle.
-
-Balls are a box of 16 numbers or a mixture of start states; a YAML with the key ``components`` holds the latter.
-"""
+"""Finds the paper's distributions by name: ``player1/M0`` to ``player5/M2``, large, medium, narrow, s2r-oracle."""
 
 from __future__ import annotations
 
@@ -11,14 +8,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from ballmodel.distribution import BallDistribution, BoxFile, load_distribution, parse_distribution
+from ballmodel.distribution import BallDistribution, BallMixture, BoxFile, MixtureFile
+from ballmodel.io import validation, yaml
 from ballmodel.io.validation import Section, find, validate
-from ballmodel.io.yaml import read as read_yaml
-from ballmodel.mixture import BallMixture, parse_mixture
 
 Balls: TypeAlias = BallDistribution | BallMixture
 
-FOLDER = Path(__file__).parent / "data"
+PAPER = Path(__file__).parent / "data" / "paper.yaml"
 
 
 @dataclass(frozen=True)
@@ -34,57 +30,55 @@ class Skill:
     max: int
 
 
-class PlayerFile(Section):
-    """The YAML of one of the paper's players: a box for each round, and the player's skill."""
+class PaperFile(Section):
+    """The YAML of the paper's balls and players."""
 
-    name: str
-    """Name of the player."""
     source: str
-    """Where the numbers come from."""
-    paper: Any = None
-    """Notes on the published table."""
-    skill: Skill
-    """Level and rally lengths."""
-    models: dict[str, BoxFile]
-    """By the name of the round."""
+    """Where the numbers of a ball come from that names no other."""
+    balls: dict[str, BoxFile]
+    """By name; of a player for each round."""
+    skills: dict[str, Skill]
+    """Levels and rally lengths of the players."""
 
 
 @cache
-def _catalogue() -> tuple[dict[str, BallDistribution], dict[str, Skill]]:
-    distributions, skills = {}, {}
-    for path in sorted(FOLDER.glob("*.yaml")):
-        data = read_yaml(path)
-        if "models" not in data:
-            distribution = load_distribution(path)
-            distributions[distribution.name] = distribution
-            continue
-        player = validate(PlayerFile, data, str(path))
-        skills[player.name] = player.skill
-        for model, box in player.models.items():
-            name = f"{player.name}/{model}"
-            distributions[name] = box.box(name, player.source)
-    return distributions, skills
+def _paper() -> PaperFile:
+    return validation.read(PaperFile, PAPER)
 
 
 def names() -> tuple[str, ...]:
     """The names that ``load`` knows."""
-    return tuple(_catalogue()[0])
+    return tuple(_paper().balls)
 
 
 def load(name: str) -> BallDistribution:
     """The distribution of that name, such as "player3/M1" or "narrow". Raises ValueError listing the valid names."""
-    return find(_catalogue()[0], name, "distribution")
+    return find(_paper().balls, name, "distribution").build(name, _paper().source)
 
 
 def skill(player: str) -> Skill:
     """The skill of "player1" to "player5". Raises ValueError listing the valid names."""
-    return find(_catalogue()[1], player, "player")
+    return find(_paper().skills, player, "player")
 
 
 def parse_balls(data: Any, where: str, name: str = "", source: str = "") -> Balls:
-    """Builds a distribution or a mixture from its YAML form; ``where`` opens every message. Raises ValueError."""
-    parse = parse_mixture if isinstance(data, dict) and "components" in data else parse_distribution
-    return parse(data, where, name, source)
+    """A distribution, or a mixture, from its YAML form.
+
+    Args:
+        data: what the YAML holds.
+        where: file and key, which open every message.
+        name, source: stand in for missing ones.
+
+    Raises:
+        ValueError: naming the key at fault, what was given and what is allowed.
+    """
+    if not (isinstance(data, dict) and "components" in data):
+        return validate(BoxFile, data, where).build(name, source)
+    file = validate(MixtureFile, data, where)
+    try:
+        return file.build(name, source)
+    except ValueError as error:
+        raise ValueError(f"{where}: components: {error}") from None
 
 
 def box_of(balls: Balls) -> BallDistribution:
@@ -102,4 +96,4 @@ def resolve(name_or_path: str | os.PathLike) -> Balls:
         return load(str(name_or_path))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a distribution's YAML or one of {', '.join(names())}")
-    return parse_balls(read_yaml(path), str(path), path.stem)
+    return parse_balls(yaml.read(path), str(path), path.stem)

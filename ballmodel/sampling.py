@@ -29,9 +29,8 @@ from jaxtyping import Bool, Float, Int, Key
 
 from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, elevation, surface_gap
-from ballmodel.distribution import BallDistribution
+from ballmodel.distribution import BallDistribution, BallMixture
 from ballmodel.flight import BallParams, free_step, step
-from ballmodel.mixture import BallMixture
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, ball_state
 from ballmodel.vec import Scalars, Vector
@@ -194,16 +193,17 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min: Corner, la
     return jnp.where(outcome == KEPT, UNDECIDED, outcome)
 
 
-@partial(jax.jit, static_argnames="n")
+@jax.jit
 def _propose(
-    key: Key[Array, ""], params: BallParams, box: dict[str, Array], n: int
-) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"], Int[Array, " n"]]:
-    key_position, key_velocity = jax.random.split(key)
-    shape = (3, n)
-    position = jax.random.uniform(key_position, shape, minval=box["position_min"], maxval=box["position_max"])
-    velocity = jax.random.uniform(key_velocity, shape, minval=box["velocity_min"], maxval=box["velocity_max"])
-    outcome = coarse_outcome(params, ball_state(position, velocity), box["landing_min"][:, 0], box["landing_max"][:, 0])
-    return position, velocity, outcome
+    key: Key[Array, ""], params: BallParams, box: dict[str, tuple[Array, ...]]
+) -> tuple[Float[Array, "6 n"], Int[Array, " n"]]:
+    """Start positions and velocities, and the coarse flight's outcomes."""
+    position, velocity = (
+        jax.random.uniform(one, (3, PROPOSALS), minval=low[:, None], maxval=high[:, None])
+        for one, (low, high) in zip(jax.random.split(key), (box["position"], box["velocity"]), strict=True)
+    )
+    outcome = coarse_outcome(params, ball_state(position, velocity), *box["landing"])
+    return jnp.concatenate([position, velocity]), outcome
 
 
 def sample_pool(
@@ -225,43 +225,41 @@ def sample_pool(
         raise ValueError(f"n is {n}; at least one ball is wanted")
     if isinstance(distribution, BallMixture):
         return _sample_mixture(key, distribution, without_nominal(params), n, dt, max(min_acceptance, 1e-3))
-    ends = [f"{part}_{end}" for part in ("position", "velocity", "landing") for end in ("min", "max")]
-    box = {end: jnp.asarray(getattr(distribution, end))[:, None] for end in ends}
-    landing_box = (box["landing_min"][:, 0], box["landing_max"][:, 0])
     params = without_nominal(params)
+    box = {
+        part: tuple(jnp.asarray(getattr(distribution, f"{part}_{end}")) for end in ("min", "max"))
+        for part in ("position", "velocity", "landing")
+    }
     fewest_proposals = int(np.ceil(10.0 / min_acceptance))
 
     waiting = np.empty((6, 0), np.float32)  # passed the coarse flight, not yet simulated
     kept: list[np.ndarray] = []
-    coarse_counts = np.zeros(len(OUTCOMES))
-    full_counts = np.zeros(len(OUTCOMES))
-    proposals = passed = calls = 0
+    coarse_counts, full_counts = np.zeros((2, len(OUTCOMES)))
+    proposals = 0
 
     def shares() -> np.ndarray:
         """Fractions of all proposals by outcome; the waiting ones are taken to fare like the simulated ones."""
-        return coarse_counts / max(proposals, 1) + passed / max(proposals, 1) * full_counts / max(full_counts.sum(), 1)
+        passed = proposals - coarse_counts.sum()
+        return coarse_counts / proposals + passed / proposals * full_counts / max(full_counts.sum(), 1)
 
     while full_counts[KEPT] < n:
-        position, velocity, outcome = (
-            np.asarray(a) for a in _propose(jax.random.fold_in(key, calls), params, box, PROPOSALS)
-        )
-        calls, proposals = calls + 1, proposals + PROPOSALS
+        rows, outcome = map(np.asarray, _propose(jax.random.fold_in(key, proposals // PROPOSALS), params, box))
+        proposals += PROPOSALS
         open_ = outcome == UNDECIDED
-        passed += int(open_.sum())
         coarse_counts += np.bincount(outcome[~open_], minlength=len(OUTCOMES))
-        waiting = np.concatenate([waiting, np.concatenate([position[:, open_], velocity[:, open_]])], axis=1)
+        waiting = np.concatenate([waiting, rows[:, open_]], axis=1)
         while (missing := n - full_counts[KEPT]) > 0 and waiting.shape[1] >= min(CHUNK, 2 * missing):
             chunk, waiting = waiting[:, :CHUNK], waiting[:, CHUNK:]
             size = chunk.shape[1]
             padded = np.pad(chunk, ((0, 0), (0, CHUNK - size)), mode="edge")
-            result = throw(params, ball_state(padded[:3], padded[3:]), *landing_box, dt)
+            result = throw(params, ball_state(padded[:3], padded[3:]), *box["landing"], dt)
             outcome = np.asarray(result.outcome)[:size]
             if distribution.short_balls:
                 outcome = np.where(outcome == SECOND_BOUNCE, KEPT, outcome)
             good = outcome == KEPT
             full_counts += np.bincount(outcome, minlength=len(OUTCOMES))
-            rows = [chunk, np.asarray(result.arrival)[None, :size], np.asarray(result.landing)[:, :size]]
-            kept.append(np.concatenate(rows)[:, good])
+            found = np.concatenate([padded, np.asarray(result.arrival)[None], np.asarray(result.landing)])
+            kept.append(found[:, :size][:, good])
         if proposals >= fewest_proposals and shares()[KEPT] < min_acceptance:
             raise ValueError(_complaint(distribution, proposals, shares()))
 

@@ -75,14 +75,14 @@ def acceleration(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np
 
     time (n,) [s], position (3, n).
     """
-    n = len(time)
     step = float(np.median(np.diff(time)))
-    w = int(np.clip(round(SPAN / step), 2, (n - 1) // 2))
-    a, b, c = slice(0, n - 2 * w), slice(w, n - w), slice(2 * w, n)
-    p = position
-    first = (p[:, b] - p[:, a]) / (time[b] - time[a])
-    second = (p[:, c] - p[:, b]) / (time[c] - time[b])
-    bend = 2.0 * (second - first) / (time[c] - time[a])
-    velocity = 0.5 * (first + second)
+    velocity, bend = differentiate_twice(time, position, int(np.clip(round(SPAN / step), 2, (len(time) - 1) // 2)))
     fall = bend + DRAG * np.linalg.norm(velocity, axis=0) * velocity
     return np.median(bend, axis=1), np.median(fall, axis=1)
+
+
+def differentiate_twice(time: np.ndarray, values: np.ndarray, w: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivatives (..., n - 2 w) of values (..., n), each by three samples that are w apart."""
+    slope = (values[..., w:] - values[..., :-w]) / (time[w:] - time[:-w])
+    early, late = slope[..., :-w], slope[..., w:]
+    return 0.5 * (early + late), 2.0 * (late - early) / (time[2 * w :] - time[: -2 * w])

@@ -33,31 +33,9 @@ class Trajectory:
         time, position = np.asarray(self.time, np.float64), np.asarray(self.position, np.float64)
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "position", position)
-        if time.ndim != 1 or time.size == 0 or position.shape != (3, time.size):
-            raise ValueError(
-                f"{self.label}: time (n,) and position (3, n) are wanted, got {time.shape} and {position.shape}"
-            )
-        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(position))):
-            sample = int(np.argmax(~np.isfinite(time) | ~np.all(np.isfinite(position), axis=0)))
-            raise ValueError(
-                f"{self.label}: sample {sample} is not finite: t={time[sample]}, position={position[:, sample]}"
-            )
-        if np.any(np.diff(time) <= 0.0):
-            sample = int(np.argmax(np.diff(time) <= 0.0)) + 1
-            raise ValueError(
-                f"{self.label}: time must increase, sample {sample} has t={time[sample]} after t={time[sample - 1]}"
-            )
-        farthest = np.abs(position).max()
-        if farthest > LARGEST_COORDINATE:
-            raise ValueError(
-                f"{self.label}: a coordinate of {farthest:g} is no place near a table; "
-                "metres are wanted (are these millimetres?)"
-            )
-        if time[-1] - time[0] > LONGEST:
-            raise ValueError(
-                f"{self.label}: lasts {time[-1] - time[0]:g}, one ball's flight in seconds is wanted "
-                "(are these milliseconds?)"
-            )
+        problem = _find_problem(time, position)
+        if problem:
+            raise ValueError(f"{self.label}: {problem}")
 
     @property
     def label(self) -> str:
@@ -70,6 +48,24 @@ class Trajectory:
     def part(self, start: int, stop: int) -> Trajectory:
         """Samples start to stop - 1."""
         return Trajectory(self.session, self.name, self.time[start:stop], self.position[:, start:stop])
+
+
+def _find_problem(time: np.ndarray, position: np.ndarray) -> str:
+    """What keeps the numbers from being a ball's; empty: nothing."""
+    if time.ndim != 1 or time.size == 0 or position.shape != (3, time.size):
+        return f"time (n,) and position (3, n) are wanted, got {time.shape} and {position.shape}"
+    if not (np.all(np.isfinite(time)) and np.all(np.isfinite(position))):
+        sample = int(np.argmax(~np.isfinite(time) | ~np.all(np.isfinite(position), axis=0)))
+        return f"sample {sample} is not finite: t={time[sample]}, position={position[:, sample]}"
+    if np.any(np.diff(time) <= 0.0):
+        sample = int(np.argmax(np.diff(time) <= 0.0)) + 1
+        return f"time must increase, sample {sample} has t={time[sample]} after t={time[sample - 1]}"
+    farthest, length = np.abs(position).max(), time[-1] - time[0]
+    if farthest > LARGEST_COORDINATE:
+        return f"a coordinate of {farthest:g} is no place near a table; metres are wanted (are these millimetres?)"
+    if length > LONGEST:
+        return f"lasts {length:g}, one ball's flight in seconds is wanted (are these milliseconds?)"
+    return ""
 
 
 @dataclass(frozen=True)

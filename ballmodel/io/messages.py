@@ -10,15 +10,16 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.exceptions import McapError
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.reader import NonSeekingReader
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
@@ -30,6 +31,7 @@ TOPIC = "/ball"
 FRAME = "table"
 NANO = 1_000_000_000
 Decoder = Callable[[bytes], Any]
+Log = Iterable[tuple[str, float, Any]]  # topic, logged time [s] and content of each message
 
 _NUMBER, _TEXT, _COUNT = {"type": "number"}, {"type": "string"}, {"type": "integer", "minimum": 0}
 SCHEMA = {
@@ -58,9 +60,8 @@ def write_mcap(path: str | os.PathLike, dataset: Dataset) -> None:
         channel = writer.register_channel(TOPIC, "json", schema)
         for trajectory in dataset:
             if trajectory.time[0] < 0.0:
-                raise ValueError(
-                    f"{trajectory.label}: starts at t={trajectory.time[0]}; MCAP holds no time before zero"
-                )
+                start = trajectory.time[0]
+                raise ValueError(f"{trajectory.label}: starts at t={start}; MCAP holds no time before zero")
             for i, (t, (x, y, z)) in enumerate(zip(trajectory.time, trajectory.position.T, strict=True)):
                 stamp = round(float(t) * NANO)
                 message = {
@@ -84,43 +85,35 @@ def read_mcap(path: str | os.PathLike, options: TrackOptions) -> Samples:
     return _collect(path, _read_mcap(Path(path), options, notes), options, notes)
 
 
-def _read_mcap(path: Path, options: TrackOptions, notes: list[str]) -> Iterator[tuple[str, float, Any]]:
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[str, Decoder | None]] = {}
-    complete, cause, decoded = False, "it ends without a footer", 0
+def _read_mcap(path: Path, options: TrackOptions, notes: list[str]) -> Log:
+    decoders: dict[int, Decoder | None] = {}
+    damage, decoded = None, 0
     with open(path, "rb") as stream:
-        records = iter(StreamReader(stream, validate_crcs=True).records)
+        reader = NonSeekingReader(stream, validate_crcs=True)
+        records = reader.iter_messages(options.topic and [options.topic], log_time_order=False)
         while True:
             try:
-                record = next(records, None)
+                schema, channel, record = next(records)
+            except StopIteration:
+                break
             except (McapError, ZstdError, ValueError, OSError, struct.error) as error:
-                cause = f"{type(error).__name__}: {error}"
+                damage = f"damaged or cut short ({type(error).__name__}: {error})"
                 break
-            if record is None:
-                break
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record.topic, _choose_decoder(record, schemas.get(record.schema_id))
-            elif isinstance(record, Footer):
-                complete = True
-            elif isinstance(record, Message):
-                topic, decode = channels[record.channel_id]
-                if decode is None or options.topic not in (None, topic):
-                    continue
-                try:
-                    message = decode(record.data)
-                except Exception as error:  # of whatever library decodes it
-                    raise ValueError(f"{path}: message {decoded} on {topic}: {error}") from None
-                decoded += 1
-                yield topic, record.log_time / NANO, message
-    if not complete and not options.salvage:
-        raise ValueError(
-            f"{path}: damaged or cut short ({cause}); its complete chunks hold {decoded} messages, "
-            "read them with --salvage"
-        )
-    if not complete:
-        notes.append(f"the file is damaged or cut short ({cause}); its complete chunks were read")
+            if channel.id not in decoders:
+                decoders[channel.id] = _choose_decoder(channel, schema)
+            decode = decoders[channel.id]
+            if decode is None:
+                continue
+            try:
+                message = decode(record.data)
+            except Exception as error:  # of whatever library decodes it
+                raise ValueError(f"{path}: message {decoded} on {channel.topic}: {error}") from None
+            decoded += 1
+            yield channel.topic, record.log_time / NANO, message
+    if damage and not options.salvage:
+        raise ValueError(f"{path}: {damage}; its complete chunks hold {decoded} messages, read them with --salvage")
+    if damage:
+        notes.append(f"the file is {damage}; its complete chunks were read")
 
 
 def _choose_decoder(channel: Channel, schema: Schema | None) -> Decoder | None:
@@ -149,7 +142,7 @@ def read_bag(path: str | os.PathLike, options: TrackOptions) -> Samples:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
 
-    def messages() -> Iterator[tuple[str, float, Any]]:
+    def messages() -> Log:
         try:
             with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 wanted = [c for c in reader.connections if options.topic in (None, c.topic)]
@@ -186,30 +179,31 @@ def _find_time(message: Any) -> float | None:
     return None
 
 
-def _collect(
-    path: str | os.PathLike, messages: Iterator[tuple[str, float, Any]], options: TrackOptions, notes: list[str]
-) -> Samples:
-    balls: dict[str, list[tuple[float, float, float, float, str, str]]] = {}
-    topics: dict[str, int] = {}
+def _collect(path: str | os.PathLike, messages: Log, options: TrackOptions, notes: list[str]) -> Samples:
+    """The samples on the topic that the options name, or else the ball's, or the only one with points."""
+    balls: dict[str, list[tuple[float, ...]]] = {}
+    labels: dict[str, list[tuple[str, ...]]] = {}
+    topics: Counter[str] = Counter()
     for topic, logged, message in messages:
-        topics[topic] = topics.get(topic, 0) + 1
+        where = f"{path}: message {topics[topic]} on {topic}"
+        topics[topic] += 1
         point, stamp = _find_point(message), _find_time(message)
         if point is None:
             if topic == (options.topic or TOPIC):
-                raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: expected a point with x, y and z")
+                raise ValueError(f"{where}: expected a point with x, y and z")
             continue
         try:
-            x, y, z = (float(_get(point, axis)) for axis in "xyz")
+            position = [float(_get(point, axis)) for axis in "xyz"]
         except (TypeError, ValueError):
-            raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: x, y, z are no numbers") from None
-        session, name = (str(_get(message, key) or "") for key in ("session", "trajectory"))
-        balls.setdefault(topic, []).append((logged if stamp is None else stamp, x, y, z, session, name))
+            raise ValueError(f"{where}: x, y, z are no numbers") from None
+        balls.setdefault(topic, []).append((logged if stamp is None else stamp, *position))
+        labels.setdefault(topic, []).append(tuple(str(_get(message, key) or "") for key in ("session", "trajectory")))
     chosen = options.topic or (TOPIC if TOPIC in balls else next(iter(balls), None))
     if chosen not in balls:
         listed = ", ".join(topics) or "none"
         raise ValueError(f"{path}: no point on the topic {chosen or TOPIC}; topics that can be read: {listed}")
     if options.topic is None and chosen != TOPIC and len(balls) > 1:
         raise ValueError(f"{path}: points are on {', '.join(balls)}; name the ball's: --topic {chosen}")
-    time, *position = np.array([row[:4] for row in balls[chosen]]).T
-    sessions, tracks = [row[4] for row in balls[chosen]], [row[5] for row in balls[chosen]]
-    return Samples(time, np.array(position), sessions, tracks, tuple(notes))
+    time, *places = np.array(balls[chosen]).T
+    sessions, tracks = map(list, zip(*labels[chosen], strict=True))
+    return Samples(time, np.array(places), sessions, tracks, tuple(notes))

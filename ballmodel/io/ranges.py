@@ -7,7 +7,6 @@ program has built, without pydantic, which the robot's side does not load.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Real
@@ -33,12 +32,10 @@ class Within:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema
 
-        low = None if self.low == -math.inf else self.low
-        high = None if self.high == math.inf else self.high
+        low, high = (end if math.isfinite(end) else None for end in (self.low, self.high))
         if source is int:
-            return core_schema.int_schema(
-                ge=None if low is None else math.ceil(low), le=None if high is None else math.floor(high)
-            )
+            least, most = low if low is None else math.ceil(low), high if high is None else math.floor(high)
+            return core_schema.int_schema(ge=least, le=most)
         return core_schema.float_schema(ge=low, le=high, allow_inf_nan=False)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -75,7 +72,19 @@ def check_fields(config: Any) -> None:
 
     Raises ValueError naming the first field at fault, what is allowed and the value.
     """
-    for path, value, allowed in _fields(config, ""):
+    _check("", config, None)
+
+
+def _check(path: str, value: Any, allowed: Any) -> None:
+    if isinstance(value, tuple):
+        for i, entry in enumerate(value):
+            _check(f"{path}[{i}]", entry, allowed)
+    elif is_dataclass(value):
+        owner: Any = type(value)
+        hints = type_hints(owner)
+        for field in fields(value):
+            _check(f"{path}.{field.name}".lstrip("."), getattr(value, field.name), find_note(hints[field.name]))
+    elif allowed is not None and value is not None:
         if isinstance(allowed, Within):
             number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
             right, words = number and allowed.low <= value <= allowed.high, str(allowed)
@@ -83,19 +92,3 @@ def check_fields(config: Any) -> None:
             right, words = value in get_args(allowed), " or ".join(map(repr, get_args(allowed)))
         if not right:
             raise ValueError(f"{path}: expected {words}, got {value!r}")
-
-
-def _fields(config: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Path, value and what is allowed of every annotated field, and of every entry of a tuple."""
-    owner: Any = type(config)
-    for field in fields(config):
-        allowed = find_note(type_hints(owner)[field.name])
-        waiting = [(prefix + field.name, getattr(config, field.name))]
-        while waiting:
-            path, value = waiting.pop(0)
-            if isinstance(value, tuple):
-                waiting += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
-            elif is_dataclass(value):
-                yield from _fields(value, f"{path}.")
-            elif allowed is not None and value is not None:
-                yield path, value, allowed

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from ballmodel.constants import GRAVITY
+from ballmodel.table_frame import differentiate_twice
 from ballmodel.trajectory import Dataset, Trajectory
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m]
@@ -67,6 +69,10 @@ class Samples:
     time_unit: str | None = None
 
 
+Track: TypeAlias = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "3 k"]]  # times [s], positions [m]
+Tracks: TypeAlias = Mapping[tuple[str, str], Track]  # of session and name
+
+
 def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Dataset:
     """Trajectories in metres and seconds.
 
@@ -76,32 +82,28 @@ def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Datase
     notes = list(samples.notes)
     time, position = np.asarray(samples.time, float), np.asarray(samples.position, float)
     known = np.isfinite(time) & np.isfinite(position).all(axis=0)
-    same = (
-        known & (position[0] == position[1]) & (position[1] == position[2])
-    )  # no ball is there: 0, 0, 0 or -1, -1, -1
-    for lost, words in (
-        (~known, "without all their numbers"),
-        (same, "with three equal coordinates, which mark no ball"),
-    ):
+    same = known & (position == position[0]).all(axis=0)
+    words = "without all their numbers", "with three equal coordinates, which mark no ball"  # 0, 0, 0 or -1, -1, -1
+    for lost, why in zip((~known, same), words, strict=True):
         if lost.any():
-            notes.append(f"{int(lost.sum())} of {lost.size} rows {words} were left out")
+            notes.append(f"{int(lost.sum())} of {lost.size} rows {why} were left out")
     kept = np.flatnonzero(known & ~same)
     if not kept.size:
         raise ValueError(f"{source}: expected rows with time and position of a ball, got none among {known.size}")
-    time, position = time[kept], position[:, kept]
-    keys = [(samples.session[i], samples.track[i]) for i in kept]
-    scale = _find_length(position, options.length or samples.length, notes)
+    scale = _find_length(position[:, kept], options.length or samples.length, notes)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i in kept.tolist():
+        groups.setdefault((samples.session[i], samples.track[i]), []).append(i)
     tracks = {}
-    for key, rows in _group(keys).items():
-        order = rows[np.argsort(time[rows], kind="stable")]
-        tracks[key] = time[order], scale * position[:, order]
+    for key, found in groups.items():
+        rows = np.array(found)[np.argsort(time[found], kind="stable")]
+        tracks[key] = time[rows], scale * position[:, rows]
     unit = _find_time(tracks, options.time or samples.time_unit, options.rate, source, notes)
-    trajectories, repeated, parted = [], 0, 0
+    trajectories, repeated = [], 0
     for (session, name), (stamps, places) in tracks.items():
         balls = list(_part_balls(unit * stamps, places))
         repeated += stamps.size - sum(t.size for t, _ in balls)
         flights = [flight for ball in balls for flight in _part_silences(*ball)]
-        parted += len(flights) - 1
         for number, (t, p) in enumerate(flights, start=1):
             label = name if len(flights) == 1 else f"{name}.{number}" if name else str(number)
             try:
@@ -110,31 +112,19 @@ def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Datase
                 raise ValueError(f"{source}: {error}") from None
     if repeated:
         notes.append(f"{repeated} samples that repeat a time were left out")
-    if parted:
+    if len(trajectories) > len(tracks):
         notes.append(f"{len(tracks)} tracks hold {len(trajectories)} flights, parted where the ball was unseen")
     return Dataset(tuple(trajectories), source, tuple(notes))
-
-
-def _group(keys: list[tuple[str, str]]) -> dict[tuple[str, str], np.ndarray]:
-    rows: dict[tuple[str, str], list[int]] = {}
-    for i, key in enumerate(keys):
-        rows.setdefault(key, []).append(i)
-    return {key: np.array(found) for key, found in rows.items()}
 
 
 def _find_length(position: Float[np.ndarray, "3 n"], told: str | None, notes: list[str]) -> float:
     """Metres of one unit: balls are a few metres, hundreds of centimetres, thousands of millimetres from any origin."""
     if told is None:
-        size = float(np.median(np.abs(position).max(axis=0)))
-        told = "m" if size < 20.0 else "cm" if size < 400.0 else "mm"
+        far = float(np.median(np.abs(position).max(axis=0)))
+        told = "m" if far < 20.0 else "cm" if far < 400.0 else "mm"
         if told != "m":
-            notes.append(
-                f"positions were taken for {told}: half of the samples are {size:.0f} and more from the origin"
-            )
+            notes.append(f"positions were taken for {told}: half of the samples are {far:.0f} and more from the origin")
     return LENGTHS[told]
-
-
-Tracks = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
 
 
 def _find_time(tracks: Tracks, told: str | None, rate: float | None, source: str, notes: list[str]) -> float:
@@ -161,19 +151,15 @@ def _find_time(tracks: Tracks, told: str | None, rate: float | None, source: str
 
 def _find_rate(tracks: Tracks, source: str) -> float:
     """Frames a second from the fall [m / frame^2] of the balls."""
-    falls = []
+    bends = [np.zeros(0)]
     for time, position in tracks.values():
-        n = time.size
-        w = min(6, (n - 1) // 2)
-        if w < 2:
-            continue
-        a, b, c = slice(0, n - 2 * w), slice(w, n - w), slice(2 * w, n)
-        late, early = time[c] - time[b], time[b] - time[a]
-        z = position[2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bend = 2.0 * ((z[c] - z[b]) / late - (z[b] - z[a]) / early) / (late + early)
-        falls.append(bend[np.isfinite(bend)])
-    fall = -float(np.median(np.concatenate(falls))) if falls else 0.0
+        w = min(6, (time.size - 1) // 2)
+        if w >= 2:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                bends.append(differentiate_twice(time, position[2], w)[1])
+    bend = np.concatenate(bends)
+    bend = bend[np.isfinite(bend)]
+    fall = -float(np.median(bend)) if bend.size else 0.0
     rate = np.sqrt(GRAVITY / fall) if fall > 0.0 else np.nan
     near = min(RATES, key=lambda r: abs(np.log(r / rate))) if np.isfinite(rate) else 0
     if not near or abs(near / rate - 1.0) > RATE_ERROR:
@@ -181,23 +167,21 @@ def _find_rate(tracks: Tracks, source: str) -> float:
     return float(near)
 
 
-def _part_balls(
-    time: Float[np.ndarray, " n"], position: Float[np.ndarray, "3 n"]
-) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, "3 k"]]]:
+def _part_balls(time: Float[np.ndarray, " n"], position: Float[np.ndarray, "3 n"]) -> Iterator[Track]:
     """The balls of one track with increasing times; samples that say the same again are dropped."""
     new = np.diff(time, prepend=-np.inf) > 0.0
     again = np.flatnonzero(~new)
-    apart = [i for i in again if np.linalg.norm(position[:, i] - position[:, i - 1]) > 0.02]
-    if len(apart) < max(3, 0.05 * time.size):
+    apart = np.linalg.norm(position[:, again] - position[:, again - 1], axis=0) > 0.02
+    if apart.sum() < max(3, 0.05 * time.size):
         yield time[new], position[:, new]
         return
     balls: list[list[int]] = []
     for moment in np.split(np.arange(time.size), np.flatnonzero(new)[1:]):
         open_balls = [ball for ball in balls if time[moment[0]] - time[ball[-1]] < SILENCE]
-        expected = [_extrapolate(time, position, ball, time[moment[0]]) for ball in open_balls]
         left = set(moment.tolist())
         if open_balls:
-            distance = np.linalg.norm(np.stack(expected)[:, :, None] - position[None][:, :, moment], axis=1)
+            expected = np.stack([_extrapolate(time, position, ball, time[moment[0]]) for ball in open_balls])
+            distance = np.linalg.norm(expected[:, :, None] - position[None][:, :, moment], axis=1)
             for row, column in zip(*linear_sum_assignment(distance), strict=True):
                 if distance[row, column] < REACH:
                     open_balls[row].append(int(moment[column]))
@@ -216,13 +200,10 @@ def _extrapolate(time: np.ndarray, position: np.ndarray, ball: list[int], at: fl
     return position[:, last] + velocity * (at - time[last])
 
 
-def _part_silences(
-    time: Float[np.ndarray, " n"], position: Float[np.ndarray, "3 n"]
-) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, "3 k"]]]:
+def _part_silences(time: Float[np.ndarray, " n"], position: Float[np.ndarray, "3 n"]) -> Iterator[Track]:
     """The pieces of a track that is longer than one flight, parted where its ball was unseen."""
+    steps = np.diff(time)
     cuts = np.zeros(0, int)
     if time[-1] - time[0] > ONE_FLIGHT:
-        steps = np.diff(time)
         cuts = np.flatnonzero(steps > max(SILENCE, SILENT_SAMPLES * float(np.median(steps)))) + 1
-    for part in np.split(np.arange(time.size), cuts):
-        yield time[part], position[:, part]
+    yield from zip(np.split(time, cuts), np.split(position, cuts, axis=1), strict=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +18,15 @@ import pandas as pd
 from ballmodel.io.samples import FRAMES, LENGTHS, TIMES, Samples, TrackOptions
 
 COLUMNS = ("session", "trajectory", "t", "x", "y", "z")
-NUMBERS = ("t", "x", "y", "z")
-# Names in small letters without units, blanks and underscores; earlier ones are preferred.
-ALIASES = {
-    "session": ("session", "match", "recording", "game"),
-    "trajectory": (
-        "trajectory",
-        "trajectoryid",
-        "traj",
-        "track",
-        "trackid",
-        "ball",
-        "ballid",
-        "flight",
-        "stroke",
-        "id",
-    ),
-    "t": ("t", "time", "timestamp", "stamp", "seconds", "frame", "frameid", "framenumber", "frameno", "frameidx"),
-    **{
-        axis: (
-            axis,
-            *(f"{word}{axis}" for word in ("pos", "position", "ball", "point", "p")),
-            f"{axis}pos",
-            f"{axis}3d",
-        )
-        for axis in "xyz"
-    },
-}
+NUMBERS = COLUMNS[2:]
 FRAME_NAMES = ("frame", "frameid", "framenumber", "frameno", "frameidx")
+# Names in small letters without units, blanks and underscores; earlier ones are preferred.
+ALIASES: dict[str, tuple[str, ...]] = {
+    "session": ("session", "match", "recording", "game"),
+    "trajectory": tuple("trajectory trajectoryid traj track trackid ball ballid flight stroke id".split()),
+    "t": ("t", "time", "timestamp", "stamp", "seconds", *FRAME_NAMES),
+    **{a: (a, f"pos{a}", f"position{a}", f"ball{a}", f"point{a}", f"p{a}", f"{a}pos", f"{a}3d") for a in "xyz"},
+}
 CONFIDENCE = ("confidence", "conf", "score", "probability", "visible")
 HEADERLESS = {4: NUMBERS, 5: COLUMNS[1:], 6: COLUMNS}
 SEPARATORS = (";", "\t", "|", ",")
@@ -59,21 +41,14 @@ def read_table(path: str | os.PathLike, options: TrackOptions) -> Samples:
         ValueError: naming file, row and column at fault, and the option that mends it.
     """
     path = Path(path)
-    suffix, first = path.suffix.lower(), 1
+    reader = READERS.get(path.suffix.lower())
     try:
-        if suffix in (".json", ".jsonl", ".ndjson"):
-            table = _read_json(path)
-        elif suffix in (".npy", ".npz"):
-            table = _read_arrays(path)
-        elif suffix == ".parquet":
-            table = _read_parquet(path)
-        else:
-            table, first = _read_text(path)
+        table, first = (reader(path), 1) if reader else _read_text(path)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path}: not readable as a table: {error}") from None
     if not len(table):
         raise ValueError(f"{path}: no row follows the header")
-    return _pick(path, table, first, options)
+    return _pick(path, table.rename(columns=str), first, options)
 
 
 def _read_text(path: Path) -> tuple[pd.DataFrame, int]:
@@ -82,44 +57,40 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, int]:
     start = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
     if start is None:
         raise ValueError(f"{path}: holds no row")
-    head = lines[start]
-    separator = max(SEPARATORS, key=head.count)
-    if not head.count(separator):
-        separator = r"\s+"
-    below = " ".join(lines[start : start + 5])
+    head, below = lines[start], " ".join(lines[start : start + 5])
+    most = max(SEPARATORS, key=head.count)
+    separator = most if most in head else None  # blanks
     decimal = "," if separator != "," and re.search(r"\d,\d", below) and not re.search(r"\d\.\d", below) else "."
-    cells = re.split(re.escape(separator) if separator in SEPARATORS else separator, head.strip())
-    numeric = [_is_number(cell, decimal) for cell in cells]
-    bare = sum(numeric) >= max(len(cells) - 2, 1)
-    names = HEADERLESS.get(len(cells)) if bare else tuple(cell.strip().strip("\"'") for cell in cells)
+    cells = [cell.strip() for cell in head.strip().split(separator)]
+    bare = sum(_is_number(cell.replace(decimal, ".")) for cell in cells) >= max(len(cells) - 2, 1)
+    names = HEADERLESS.get(len(cells)) if bare else tuple(cell.strip("\"'") for cell in cells)
+    row = f"{path}: row {start + 1}:"
     if names is None:
-        raise ValueError(
-            f"{path}: row {start + 1}: {len(cells)} numbers and no header; write one, such as trajectory,t,x,y,z"
-        )
+        raise ValueError(f"{row} {len(cells)} numbers and no header; write one, such as trajectory,t,x,y,z")
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{path}: row {start + 1}: column {name!r} is there {names.count(name)} times")
-    roles = {name: role for role, name in find_columns(names).items()}
+            raise ValueError(f"{row} column {name!r} is there {names.count(name)} times")
+    skipped = start if bare else start + 1
     table = pd.read_csv(
         path,
-        sep=separator,
+        sep=separator or r"\s+",
         decimal=decimal,
         header=None,
         names=list(names),
-        skiprows=start + (0 if bare else 1),
+        skiprows=skipped,
         comment="#",
         encoding="utf-8-sig",
         na_values=MISSING,
         index_col=False,
         skipinitialspace=True,
-        dtype={name: str for name in names if roles.get(name) in ("session", "trajectory")},
+        dtype={name: str for role, name in _find_columns(names).items() if role not in NUMBERS},
     )
-    return table, start + (1 if bare else 2)
+    return table, skipped + 1
 
 
-def _is_number(text: str, decimal: str) -> bool:
+def _is_number(text: str) -> bool:
     try:
-        float(text.strip().replace(decimal, "."))
+        float(text)
     except ValueError:
         return False
     return True
@@ -146,50 +117,58 @@ def _read_json(path: Path) -> pd.DataFrame:
     raise ValueError(f"{path}: expected a list of objects with t, x, y, z, got {type(content).__name__}")
 
 
+def _read_array(path: Path) -> pd.DataFrame:
+    """Rows of numbers, or a structured array."""
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.names:
+        return pd.DataFrame({name: array[name] for name in array.dtype.names})
+    names = HEADERLESS.get(array.shape[1]) if array.ndim == 2 else None
+    if names is None:
+        raise ValueError(f"{path}: expected rows of t, x, y, z, got an array of shape {array.shape}")
+    return pd.DataFrame(array, columns=list(names))
+
+
 def _read_arrays(path: Path) -> pd.DataFrame:
-    """An array of rows, or named arrays, of which one may hold all three coordinates."""
-    loaded = np.load(path, allow_pickle=False)
-    if isinstance(loaded, np.ndarray):
-        if loaded.dtype.names:
-            return pd.DataFrame({name: loaded[name] for name in loaded.dtype.names})
-        names = HEADERLESS.get(loaded.shape[1]) if loaded.ndim == 2 else None
-        if names is None:
-            raise ValueError(f"{path}: expected rows of t, x, y, z, got an array of shape {loaded.shape}")
-        return pd.DataFrame(loaded, columns=list(names))
+    """Named arrays, of which one may hold all three coordinates."""
+    arrays = dict(np.load(path, allow_pickle=False))
     columns: dict[str, np.ndarray] = {}
-    for name in loaded.files:
-        array = loaded[name]
+    for name, array in arrays.items():
         if array.ndim == 2 and 3 in array.shape:
             columns |= dict(zip("xyz", array.T if array.shape[1] == 3 else array, strict=True))
         elif array.ndim == 1:
             columns[name] = array
     if len({len(column) for column in columns.values()}) != 1:
-        shapes = ", ".join(f"{name} {loaded[name].shape}" for name in loaded.files)
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
         raise ValueError(f"{path}: expected arrays of equal lengths with times and positions, got {shapes}")
     return pd.DataFrame(columns)
 
 
-def _plain(name: str) -> tuple[str, str]:
-    """A column's name without unit, and the unit: "Pos X [mm]" -> "posx", "mm"."""
-    words = [word for word in re.split(r"[^a-z0-9]+", str(name).lower().replace("µ", "u")) if word]
+READERS: dict[str, Callable[[Path], pd.DataFrame]] = {
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), _read_json),
+    ".npy": _read_array,
+    ".npz": _read_arrays,
+    ".parquet": _read_parquet,
+}
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """A column's name in ALIASES' form, and its unit: "Pos X [mm]" -> "posx", "mm"."""
+    words = [word for word in re.split(r"[^a-z0-9]+", name.lower().replace("µ", "u")) if word]
     unit = words.pop() if len(words) > 1 and words[-1] in {*LENGTHS, *TIMES} else ""
     return "".join(words), unit
 
 
-def find_columns(names: tuple[str, ...] | list[str]) -> dict[str, str]:
+def _find_columns(names: Sequence[str]) -> dict[str, str]:
     """Which of a table's columns is which of COLUMNS."""
-    plain = {_plain(name)[0]: name for name in reversed(names)}
-    return {
-        role: next(plain[a] for a in aliases if a in plain)
-        for role, aliases in ALIASES.items()
-        if {*aliases} & {*plain}
-    }
+    plain = {_split_unit(name)[0]: name for name in reversed(names)}
+    found = {role: [plain[alias] for alias in aliases if alias in plain] for role, aliases in ALIASES.items()}
+    return {role: columns[0] for role, columns in found.items() if columns}
 
 
 def _pick(path: Path, table: pd.DataFrame, first: int, options: TrackOptions) -> Samples:
-    names = [str(name) for name in table.columns]
-    table.columns = pd.Index(names)
-    if EVENTS <= {_plain(name)[0] for name in names}:
+    names = list(table.columns)
+    plain = {name: _split_unit(name)[0] for name in names}
+    if EVENTS <= {*plain.values()}:
         raise ValueError(
             f"{path}: holds events, no tracks; with ball_vel_out and ball_spin_out, `mjx-tt fit-human` reads them"
         )
@@ -197,33 +176,28 @@ def _pick(path: Path, table: pd.DataFrame, first: int, options: TrackOptions) ->
         if role not in COLUMNS or name not in names:
             expected = ", ".join(COLUMNS if role not in COLUMNS else names)
             raise ValueError(f"{path}: --columns {role}={name}: expected one of {expected}")
-    found = find_columns(names) | dict(options.columns)
+    found = _find_columns(names) | dict(options.columns)
     missing = [role for role in NUMBERS if role not in found]
     if missing:
         raise ValueError(
             f"{path}: row {max(first - 1, 1)}: no column is known as {', '.join(missing)}; there are "
             f"{', '.join(names)}. Name them: --columns {','.join(f'{role}=NAME' for role in missing)}"
         )
-    numbers = {role: _convert(path, table[found[role]], found[role], first) for role in NUMBERS}
-    notes = []
-    confidence = next((name for name in names if _plain(name)[0] in CONFIDENCE), None)
+    time, *position = (_convert(path, table[found[role]], found[role], first) for role in NUMBERS)
+    confidence = next((name for name in names if plain[name] in CONFIDENCE), None)
     if confidence is not None:
         unseen = pd.to_numeric(table[confidence], errors="coerce").to_numpy(float) <= 0.0
-        numbers["x"] = np.where(unseen, np.nan, numbers["x"])
+        position[0] = np.where(unseen, np.nan, position[0])
     unused = [name for name in names if name not in found.values() and name != confidence]
-    if unused:
-        notes.append(f"columns that were not used: {', '.join(unused)}")
-    text = {role: _labels(table, found.get(role)) for role in ("session", "trajectory")}
-    units = {_plain(found[role])[1] for role in "xyz"} - {""}
-    name, unit = _plain(found["t"])
+    units = {_split_unit(found[axis])[1] for axis in "xyz"} - {""}
     return Samples(
-        numbers["t"],
-        np.stack([numbers[axis] for axis in "xyz"]),
-        text["session"],
-        text["trajectory"],
-        tuple(notes),
+        time,
+        np.stack(position),
+        _labels(table, found.get("session")),
+        _labels(table, found.get("trajectory")),
+        (f"columns that were not used: {', '.join(unused)}",) if unused else (),
         units.pop() if len(units) == 1 else None,
-        FRAMES if name in FRAME_NAMES else unit or None,
+        FRAMES if plain[found["t"]] in FRAME_NAMES else _split_unit(found["t"])[1] or None,
     )
 
 

@@ -149,7 +149,8 @@ def _show_fits(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, path: Path, console: Console) -> None:
     """Fits and writes the mixture, compares balls of both with the strokes, and draws them."""
-    from ballmodel.mixture import fit_mixture, save_mixture
+    from ballmodel.distribution import save_distribution
+    from ballmodel.fit_distribution import fit_mixture
     from experiments.evaluation import human_likeness
 
     try:
@@ -157,7 +158,7 @@ def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, p
     except ValueError as error:
         raise ConfigError(f"--mixture {path}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_mixture(path, replace(fitted, short_balls=box.short_balls))
+    save_distribution(path, replace(fitted, short_balls=box.short_balls))
     size = f"{choice.chosen} components of {choice.balls:,} balls, with spin"
     console.print(f"mixture: {path}  ({size}; balls: {path.name})")
     for line in human_likeness.compare(report.landed, box, ball, path.with_suffix(".png")):

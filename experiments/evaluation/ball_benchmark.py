@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from ballmodel.io import MeasuredStates, SpinDataset, read, read_events, read_spindoe
 from ballmodel.io.atomic_files import replacing
-from ballmodel.io.spindoe import INDEX
+from ballmodel.io.formats import INDEX
 from experiments.errors import ConfigError
 from mjx_tt.prediction.benchmark import WINDOW, Benchmark, Score, benchmark, landing_benchmark
 from mjx_tt.sim.model import SimModel

@@ -20,9 +20,9 @@ from sklearn.model_selection import StratifiedKFold, cross_val_predict
 from sklearn.neighbors import NearestNeighbors
 
 from ballmodel.distribution import BallDistribution
+from ballmodel.fit_distribution import fit_mixture, start_states
 from ballmodel.flight import BallParams
 from ballmodel.io.atomic_files import replacing
-from ballmodel.mixture import fit_mixture, start_states
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
 from mjx_tt.viz import html
@@ -54,7 +54,7 @@ class Likeness:
 def likeness(balls: np.ndarray, held_out: np.ndarray, known: np.ndarray, seed: int = 0) -> Likeness:
     """Likeness of a model's balls to held-out strokes, beside the strokes that the model was fitted to.
 
-    Rows (n, 6) or (n, 9) are start states (ballmodel.mixture.start_states) or their first columns; at most as many
+    Rows (n, 6) or (n, 9) are start states (``start_states``) or their first columns; at most as many
     balls as held-out strokes are used.
     """
     rng = np.random.default_rng(seed)

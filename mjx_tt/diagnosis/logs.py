@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballmodel.io.formats import GUESS, SUFFIXES, read
+from ballmodel.io.formats import GUESS, INDEX, SUFFIXES, read
 from ballmodel.io.samples import TrackOptions
-from ballmodel.io.spindoe import INDEX
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.tracks.frame import align

@@ -10,8 +10,7 @@ import jax
 import numpy as np
 
 from ballmodel import registry
-from ballmodel.distribution import BallDistribution
-from ballmodel.mixture import BallMixture
+from ballmodel.distribution import BallDistribution, BallMixture
 from ballmodel.sampling import sample_pool
 from mjx_tt.env import user_defined
 from mjx_tt.env.brax import TableTennis, register_environment

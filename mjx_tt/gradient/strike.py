@@ -118,7 +118,7 @@ def _nearest(
     away = away + row(since) * closing
     facing = blade.normal * row(jnp.where(dot(blade.normal, closing) < 0.0, 1.0, -1.0))
     speed, spin, normal, moving = (components(x) for x in (ball.velocity, ball.spin, facing, blade.velocity))
-    velocity, spin = contact.paddle_impact(params.paddle, speed, spin, normal, moving, params.flight.radius)
+    velocity, spin = contact.impact(params.paddle, speed, spin, normal, params.flight.radius, moving)
     position = blade.position + row(since) * blade.velocity + facing * params.flight.radius
     return BallState(position, stack(velocity), stack(spin)), jnp.asarray(dot(away, away))
 

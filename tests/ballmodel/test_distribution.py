@@ -11,9 +11,10 @@ import pytest
 from scipy.stats import binomtest, ks_2samp
 
 from ballmodel import registry
-from ballmodel.distribution import BallDistribution, fit_distribution, load_distribution, save_distribution
+from ballmodel.distribution import BallDistribution, load_distribution, save_distribution
+from ballmodel.fit_distribution import fit_distribution
 from ballmodel.flight import ball_params
-from ballmodel.sampling import KEPT, OUTCOMES, SECOND_BOUNCE, UNDECIDED, coarse_outcome, sample_pool, throw
+from ballmodel.sampling import KEPT, OUTCOMES, UNDECIDED, coarse_outcome, sample_pool, throw
 from ballmodel.state import BallState, ball_state
 
 pytestmark = pytest.mark.optimised
@@ -128,18 +129,6 @@ def test_pool_is_distributed_like_brute_force_rejection(box):
         assert ks_2samp(drawn[1] + drawn[pair], reference[1] + reference[pair]).pvalue > 1e-3
     assert binomtest(int(kept.sum()), kept.size, float(pool.acceptance)).pvalue > 1e-3
     assert float(pool.rejected.sum()) == pytest.approx(1.0, abs=1e-5)
-
-
-def test_short_balls_are_drawn_where_the_distribution_says_so():
-    boxes = [replace(SLOW, short_balls=short) for short in (False, True)]
-    once, short = pools = [sample_pool(jax.random.key(0), box, ball_params(), 2000) for box in boxes]
-    landing = SLOW.landing_min, SLOW.landing_max
-    outcomes = [np.asarray(throw(ball_params(), pool.state, *landing).outcome) for pool in pools]
-    assert np.all(outcomes[0] == KEPT) and set(outcomes[1]) == {KEPT, SECOND_BOUNCE}
-    share = float(once.rejected[SECOND_BOUNCE] / (once.rejected[SECOND_BOUNCE] + once.acceptance))
-    assert 0.2 < share < 0.9
-    assert binomtest(int((outcomes[1] == SECOND_BOUNCE).sum()), 2000, share).pvalue > 1e-3
-    assert float(short.acceptance) == pytest.approx(float(once.rejected[SECOND_BOUNCE] + once.acceptance), abs=0.02)
 
 
 def test_both_simulations_decide_alike_ball_by_ball():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -14,19 +15,24 @@ from ballmodel.trajectory import Dataset, Trajectory
 from tests.ballmodel.test_initial_state import flight
 
 
+def starts(n, y, speeds, climb, seed=0):
+    """Balls without spin from a place near the middle line towards the robot."""
+    rng = np.random.default_rng(seed)
+    position = np.stack([rng.uniform(-0.3, 0.3, n), np.full(n, y), rng.uniform(0.25, 0.3, n)])
+    velocity = np.stack([rng.uniform(-0.1, 0.1, n), -rng.uniform(*speeds, n), np.full(n, climb)])
+    return BallState(position, velocity, np.zeros((3, n)))
+
+
 def test_serves_start_behind_their_bounce():
     """Against the bounce of a plain parabola; drag takes little until there."""
-    rng = np.random.default_rng(0)
-    n = 40
-    position = np.stack([rng.uniform(-0.3, 0.3, n), np.full(n, 1.4), rng.uniform(0.25, 0.3, n)])
-    velocity = np.stack([rng.uniform(-0.1, 0.1, n), rng.uniform(-4.6, -4.4, n), np.full(n, -1.4)])
-    serves = MeasuredStates(np.arange(n), BallState(position, velocity, np.zeros((3, n))), "serves")
+    n, state = 40, starts(40, 1.4, (4.4, 4.6), -1.4)
+    serves = MeasuredStates(np.arange(n), state, "serves")
     with pytest.raises(ValueError, match="serves are counted with serves=True"):
         fit_human(serves, ball_params())
     box, report = fit_human(serves, ball_params(), eps=50.0, serves=True)
     assert report.serves == n
-    fall = (-1.4 + np.sqrt(1.4**2 + 2 * 9.81 * (position[2] - 0.02))) / 9.81
-    bounce = position[1] + velocity[1] * fall
+    fall = (-1.4 + np.sqrt(1.4**2 + 2 * 9.81 * (state.position[2] - 0.02))) / 9.81
+    bounce = state.position[1] + state.velocity[1] * fall
     np.testing.assert_allclose(report.landed.position[1], bounce - 4.0 * 0.02, atol=0.06)
     assert np.all(report.landed.velocity[2] > 1.5) and box.velocity_min[2] > 1.5
     assert np.all(report.landing[1] < 0.0)
@@ -34,22 +40,16 @@ def test_serves_start_behind_their_bounce():
 
 def test_what_was_seen_to_land_counts_and_the_other_player_on_request():
     """Fast balls with topspin, which by drag alone fly over the table's end."""
-    rng = np.random.default_rng(1)
-    n = 30
-    position = np.stack([rng.uniform(-0.3, 0.3, n), np.full(n, 1.5), rng.uniform(0.25, 0.3, n)])
-    velocity = np.stack([rng.uniform(-0.1, 0.1, n), rng.uniform(-11.0, -10.0, n), np.full(n, 1.5)])
+    n, state, rng = 30, starts(30, 1.5, (10.0, 11.0), 1.5), np.random.default_rng(1)
     landing = np.stack([rng.uniform(-0.5, 0.5, n), rng.uniform(-1.3, -1.0, n)])
     landing[:, 0] = np.nan  # one that nobody saw land
-    state = BallState(position, velocity, np.zeros((3, n)))
     with pytest.raises(ValueError, match="none of 30 balls lands on the robot's side"):
         fit_human(MeasuredStates(np.arange(n), state, "fast"), ball_params())
     box, report = fit_human(MeasuredStates(np.arange(n), state, "fast", landing), ball_params(), eps=50.0)
     assert report.landed.position.shape == (3, n - 1)
     np.testing.assert_allclose([box.landing_min[1], box.landing_max[1]], [landing[1, 1:].min(), landing[1, 1:].max()])
     turn = np.array([[-1.0], [-1.0], [1.0]])
-    across = BallState(
-        *(np.concatenate([part[:, ::2], turn * part[:, 1::2]], axis=1) for part in (position, velocity, state.spin))
-    )
+    across = jax.tree.map(lambda part: np.concatenate([part[:, ::2], turn * part[:, 1::2]], axis=1), state)
     both = MeasuredStates(np.arange(n), across, "rally", np.concatenate([landing[:, ::2], -landing[:, 1::2]], axis=1))
     again, _ = fit_human(both, ball_params(), eps=50.0, both_players=True)
     np.testing.assert_allclose(sixteen(again), sixteen(box))
@@ -85,16 +85,15 @@ def test_both_fits_find_the_same_sixteen_numbers():
 
 def test_a_persons_short_balls_are_drawn_if_asked_for_and_if_there_are_any():
     """Which balls are short, by parabolas and Nakashima's bounce: drag takes little, and makes them shorter."""
-    rng, n, start, climb = np.random.default_rng(1), 60, 0.8, 2.0
-    position = np.stack([rng.uniform(-0.2, 0.2, n), np.full(n, start), rng.uniform(0.25, 0.3, n)])
+    n, start, climb = 60, 0.8, 2.0
     fall = (climb + np.sqrt(climb**2 + 2 * 9.81 * 0.255)) / 9.81
     down = 9.81 * fall - climb
     for speed, short in ((2.3, True), (3.6, False)):
         after = speed * (1.0 - min(0.25 * 1.93 * down / speed, 0.4))
         second = start - speed * fall - after * 2.0 * 0.93 * down / 9.81  # [m] y of the second bounce
         assert (-1.25 < second < 0.0) if short else second < -1.6
-        velocity = np.stack([rng.uniform(-0.1, 0.1, n), -speed + rng.uniform(-0.05, 0.05, n), np.full(n, climb)])
-        strokes = MeasuredStates(np.arange(n), BallState(position, velocity, np.zeros((3, n))), "strokes")
+        state = starts(n, start, (speed - 0.05, speed + 0.05), climb)
+        strokes = MeasuredStates(np.arange(n), state, "strokes")
         for asked in (False, True):
             box, report = fit_human(strokes, ball_params(), eps=50.0, short_balls=asked)
             assert box.short_balls == (asked and short)

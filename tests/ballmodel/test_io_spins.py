@@ -32,16 +32,6 @@ def test_spindoe(tmp_path):
 HEAD = "player_id,rally_id,type,timestamp,ball_pos,ball_vel_out,ball_spin_out\n"
 
 
-def found_of_players(path):
-    """Rows as published ones are: a player in the type, a rally id of each row's own, nets."""
-    path.write_text(
-        HEAD + 'p1,m1/r0/event0,shot_p1,0.5,"[1.4, 0.2, 0.3]","[-6.0, 0.1, 1.0]","[0, 0, 0]"\n'
-        'p1,m1/r0/event1,bounce_p2,0.9,"[-0.7, 0.3, 0.02]","[-5, 0, 2]","[0, 1, 2]"\n'
-        'p2,m1/r0/event2,net,1.2,"[0, 0, 0.1]","[0, -0.5, -1]","[0, 0, 0]"\n'
-    )
-    return read_events(path)
-
-
 def test_events(tmp_path):
     path = tmp_path / "ace.csv"
     path.write_text(
@@ -56,12 +46,17 @@ def test_events(tmp_path):
     np.testing.assert_allclose(found.state.velocity[:, 0], [-0.1, -6.0, 1.0])
     np.testing.assert_allclose(found.state.spin[:, 0], [120.0, 0.0, 5.0])
     assert [list(i) for i in found.landings] == [[0], [1]]
-    players = found_of_players(path)
-    assert (
-        len(players) == 2 and players.rally == ("m1/r0", "m1/r0") and [list(i) for i in players.landings] == [[0], [1]]
+    # Rows as published ones are: a player in the type, a rally id of each row's own, nets.
+    rally = (
+        HEAD + 'p1,m1/r0/event0,shot_p1,0.5,"[1.4, 0.2, 0.3]","[-6.0, 0.1, 1.0]","[0, 0, 0]"\n'
+        'p1,m1/r0/event1,bounce_p2,0.9,"[-0.7, 0.3, 0.02]","[-5, 0, 2]","[0, 1, 2]"\n'
+        'p2,m1/r0/event2,net,1.2,"[0, 0, 0.1]","[0, -0.5, -1]","[0, 0, 0]"\n'
     )
+    path.write_text(rally)
+    players = read_events(path)
+    assert players.rally == ("m1/r0", "m1/r0") and [list(i) for i in players.landings] == [[0], [1]]
     path.write_text(
-        path.read_text()
+        rally
         + 'p1,m1/r1/event0,shot_p1,3.0,"[1.4, 0.2, 0.3]","[-6.0, 0.1, 1.0]","[0, 0, 9]"\n'
         + 'p1,m1/r1/event1,shot_p2,3.5,"[-1, -1, -1]","[0, 0, 0]","[0, 0, 0]"\n'  # stands for a ball that was lost
     )

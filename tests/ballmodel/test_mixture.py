@@ -10,8 +10,9 @@ import pytest
 from scipy.stats import ks_2samp
 
 from ballmodel import registry
+from ballmodel.distribution import BallMixture, save_distribution
+from ballmodel.fit_distribution import fit_mixture, start_states
 from ballmodel.flight import ball_params
-from ballmodel.mixture import BallMixture, fit_mixture, save_mixture, start_states
 from ballmodel.sampling import KEPT, ROBOT_SIDE, SECOND_BOUNCE, sample_pool, throw
 from ballmodel.state import BallState
 
@@ -35,7 +36,7 @@ def test_a_mixture_has_the_moments_of_what_made_it_and_reads_back(tmp_path):
     mean = mixture.weights @ mixture.means
     np.testing.assert_allclose(mean, rows.mean(axis=0), atol=0.02 * rows.std(axis=0).max())
     assert np.all(mixture.covariances[:, 8, 8] == 0.0)  # a row that does not vary stays at its value
-    save_mixture(tmp_path / "me.yaml", replace(mixture, short_balls=True))
+    save_distribution(tmp_path / "me.yaml", replace(mixture, short_balls=True))
     again = registry.resolve(tmp_path / "me.yaml")
     assert isinstance(again, BallMixture) and (again.name, again.source, again.short_balls) == ("two", "a test", True)
     np.testing.assert_allclose(again.covariances, mixture.covariances, rtol=1e-12)

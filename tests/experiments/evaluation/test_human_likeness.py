@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ballmodel import registry
-from ballmodel.mixture import BallMixture
+from ballmodel.distribution import BallMixture
 from experiments import cli
 from experiments.evaluation.human_likeness import likeness
 from tests.mjx_tt.prediction.test_predict import spinning
