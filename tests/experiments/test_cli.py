@@ -94,6 +94,14 @@ for arguments, code in {lines!r}:
     assert metadata.version("mjx-tt") in done.stdout
 
 
+def test_a_missing_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "dpkt", None)
+    (tmp_path / "arm.pcap").write_text("")
+    done = mjx_tt("log", "replay", tmp_path / "arm.pcap")
+    assert done.returncode == 1
+    assert done.stderr == "mjx-tt: error: dpkt is missing: pip install 'mjx-tt[capture]'\n"
+
+
 @pytest.mark.smoke
 def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
     _, runs, output = trained
