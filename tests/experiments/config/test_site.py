@@ -39,7 +39,7 @@ def write(folder, data):
         ),
         (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
         (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
-        ("- slurm", r"a site is a mapping with the keys provider, workers_per_node"),
+        ("- slurm", r"cluster.yaml: expected a mapping, got \['slurm'\]"),
     ],
 )
 def test_a_mistake_is_named(tmp_path, data, message):
