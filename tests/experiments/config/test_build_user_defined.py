@@ -58,8 +58,7 @@ def test_its_terms_are_measured_and_weigh(trained):
     assert list(report["terms"])[-2:] == ["calm_wrist", "deep"]
     experiment = build.experiment(config.load(trained / "my_task.yaml"), "my_task.yaml")
     assert experiment.task.reward_weights[-2:] == (0.2, 0.5)
-    own = build.definitions(experiment.config, "my_task.yaml")[0]
-    assert build.later_weights(experiment.config.training, own)[1][-2:] == (0.0, 2.0)
+    assert build.later_weights(experiment.config)[1][-2:] == (0.0, 2.0)
 
 
 @pytest.mark.slow
