@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
-from cyclopts.validators import Number
 
-from experiments.config import study
+from experiments.config import site, study
 from experiments.errors import ConfigError, error_context
 
 if TYPE_CHECKING:
     from ballmodel.io.samples import TrackOptions
     from experiments.config.build import Experiment
-    from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
     from mjx_tt.sim.model import SimModel
 
@@ -65,6 +63,17 @@ def suffixed(*allowed: str, key: str = "--out") -> Check:
     return check
 
 
+def between(low: float, high: float) -> Check:
+    """The check that a number, or each of several, lies between these ends."""
+
+    def check(_: Any, given: float | tuple[float, ...] | None) -> None:
+        for value in given if isinstance(given, tuple) else (given,):
+            if value is not None and not low < value < high:
+                raise ValueError(f"expected a number above {low:g} and below {high:g}, got {value:g}")
+
+    return check
+
+
 # -- kinds of parameters -----------------------------------------------------------------------------------------------
 
 
@@ -80,7 +89,14 @@ def argument(name: str, text: str, check: Check | None = None) -> Parameter:
 
 def count(text: str) -> Parameter:
     """A parameter that takes a whole number of at least 1."""
-    return option("N", text, Number(gte=1))
+
+    def convert(_: Any, tokens: Sequence[Token]) -> int:
+        value = tokens[0].value
+        if not value.isdigit() or int(value) < 1:
+            raise ValueError(f"expected a whole number of at least 1, got {value!r}")
+        return int(value)
+
+    return Parameter(metavar="N", help=text, converter=convert, n_tokens=1)
 
 
 def numbers(metavar: str, text: str, wanted: str, accepted: Callable[[tuple[int, ...]], bool]) -> Parameter:
@@ -110,8 +126,7 @@ RigFile = Annotated[str | None, option("YAML", "another rig: world, delays, netw
 RigSeed = Annotated[int, option("K", "seed of the balls that are thrown (default: 0)")]
 RunsFolder = Annotated[Path, option("FOLDER", "where the folders of runs go (default: runs)")]
 Site = Annotated[
-    str | None,
-    option("local|YAML", "where jobs run: this machine (default), or the workers of a site's YAML"),
+    str | None, option("local|YAML", "where jobs run: this machine (default), or the workers of a site's YAML")
 ]
 
 
@@ -153,8 +168,7 @@ class DistributedOptions:
         option("auto|HOST:PORT", "share one training with other processes: as the cluster says, or by address"),
     ] = None
     processes: Annotated[
-        int | None,
-        count("runs at a time (default: one per processor core); with HOST:PORT, number of processes"),
+        int | None, count("runs at a time (default: one per processor core); with HOST:PORT, number of processes")
     ] = None
     process: Annotated[int | None, option("I", "index of this process, from 0 (with HOST:PORT)")] = None
 
@@ -253,10 +267,8 @@ def start_jax(devices: int | None = 1, elsewhere: bool = False, cache: str | Non
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
 
 
-def load_site(name: str | None, **others: Any) -> SiteFile | None:
+def load_site(name: str | None, **others: Any) -> site.Site | None:
     """The site, None for this machine; ``others`` are options that do not go with a site. Raises ConfigError."""
-    from experiments.config import site
-
     if name is None or name == site.OWN:
         return None
     loaded = site.load(name)

@@ -10,18 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
-from cyclopts.validators import Number
+from rich.console import Console
+from rich.table import Table
 
 from experiments import options
 from experiments.commands import command
 from experiments.errors import ConfigError
-from experiments.options import argument, count, existing, option, suffixed
+from experiments.options import argument, between, count, existing, option, suffixed
 from experiments.progress import ProgressBar, make_console, seconds_left
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from ballmodel.distribution import BallDistribution
     from ballmodel.fit_distribution import HumanReport
     from ballmodel.flight import BallParams
@@ -42,18 +42,13 @@ what belongs together.
 )
 def fit_human(
     *data: Annotated[
-        str,
-        argument("DATA", "tracks of any form, .json (DeepMind) or .hdf5 (AIMY launcher)", existing()),
+        str, argument("DATA", "tracks of any form, .json (DeepMind) or .hdf5 (AIMY launcher)", existing())
     ],
     out: Annotated[Path, option("YAML", "the file to write", suffixed(".yaml", ".yml"))],
     name: Annotated[str, option("NAME", "name of the distribution (default: the output file's)")] = "",
     eps: Annotated[
         float | None,
-        option(
-            "R",
-            "radius of DBSCAN, in robust standard deviations (default: from the data)",
-            Number(gt=0, lt=math.inf),
-        ),
+        option("R", "radius of DBSCAN, in robust standard deviations (default: from the data)", between(0.0, math.inf)),
     ] = None,
     min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
     format: options.Format = None,
@@ -86,8 +81,6 @@ def fit_human(
             f"--fit {fit} --model {model}: in a model, strokes are fitted with their spins; leave one of the two out"
         )
     options.start_jax(None)
-    import numpy as np
-
     from ballmodel import registry
     from ballmodel.distribution import save_distribution
     from ballmodel.fit_distribution import Fit
@@ -165,8 +158,6 @@ def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, p
 
 
 def _print_report(report: HumanReport, console: Console) -> None:
-    import numpy as np
-
     console.print(
         f"{report.measured:,} balls measured, {report.too_short} too short, {report.elsewhere} not towards the robot"
     )
@@ -187,8 +178,6 @@ def _print_report(report: HumanReport, console: Console) -> None:
 
 def _print_numbers(balls: dict[str, BallDistribution], console: Console, bold: str = "") -> None:
     """Prints the 16 numbers of each distribution; that of the name ``bold`` stands out."""
-    from rich.table import Table
-
     from ballmodel.distribution import AXES
 
     table = Table(
@@ -252,7 +241,7 @@ def predict(
     model: options.Model = None,
     horizon: Annotated[
         tuple[float, ...],
-        option("S", "seconds after the last sample used; may be repeated (default: 0.3)", Number(gt=0, lt=5)),
+        option("S", "seconds after the last sample used; may be repeated (default: 0.3)", between(0.0, 5.0)),
     ] = (0.3,),
     seen: Annotated[float | None, option("S", "use only the first S seconds of each stroke")] = None,
     format: options.Format = None,
@@ -305,8 +294,6 @@ def bench_ball(
 @command("balls", "  mjx-tt balls\n")
 def balls() -> None:
     """Lists the paper's players and ball distributions."""
-    from rich.table import Table
-
     from ballmodel import registry
 
     screen = make_console()

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
+from rich.console import Console
 
+from ballmodel.constants import PADDLE_RADIUS
 from experiments import options
 from experiments.commands import command
+from experiments.config.files import read_yaml
 from experiments.errors import ConfigError, error_context
 from experiments.options import argument, existing, option
 from experiments.progress import make_console
-
-if TYPE_CHECKING:
-    import numpy as np
-    from rich.console import Console
-
-    from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
+from experiments.runs import run_dir
+from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
+from robot_io.contract import PAPER
 
 
 @command(
@@ -50,11 +52,7 @@ def calibrate(
     if name is not None and part != "robot":
         raise ConfigError(f"{name}: the {part}'s calibration is of no robot; allowed with calibrate robot")
     options.check_writable(out.parent)
-    from dataclasses import asdict
-
     from experiments.config import robot as robots
-    from experiments.runs import run_dir
-    from robot_io.calibrated import Calibration
 
     screen = make_console()
     known = robots.load_calibration(out) if out.exists() else Calibration()
@@ -94,11 +92,9 @@ def _tracker(path: Path, screen: Console) -> TrackerCalibration:
 
 def _robot(path: Path, name: str | None, installed: Path | None, screen: Console) -> RobotCalibration:
     """Of the robot of that name or in that folder; None: the one that robot.yaml, ``installed``, names."""
-    from ballmodel.constants import PADDLE_RADIUS
     from experiments.config import robot as robots
     from mjx_tt.robot import robots as simulated
     from robot_io.calibration import points, robot
-    from robot_io.contract import PAPER
     from robot_io.control.config import RobotConfig
 
     name = name or (robots.named(installed) if installed else None)
@@ -129,9 +125,7 @@ def _robot(path: Path, name: str | None, installed: Path | None, screen: Console
 
 def _clock(path: Path, known: Calibration, screen: Console) -> ClockCalibration:
     from experiments.config import robot as robots
-    from experiments.config.files import read_yaml
     from robot_io import log
-    from robot_io.calibrated import Calibration
     from robot_io.calibration import clock
 
     with error_context():

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from experiments import options
 from experiments.commands import command
 from experiments.errors import ConfigError, error_context
 from experiments.options import argument, option
 from experiments.progress import make_console
+from experiments.runs.run_dir import Run
+from robot_io.contract import Contract
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from experiments.runs.load_policy import TrainedPolicy
     from mjx_tt import diagnosis
     from mjx_tt.diagnosis.report import Play, Rate
     from mjx_tt.robot.robots import Robot
-    from robot_io.contract import Contract
 
 
 @Parameter(name="*")
@@ -207,7 +207,6 @@ def play(extended: Path, request: Request, console: Console) -> Play:
     from experiments.config import build
     from experiments.evaluation import evaluate
     from experiments.runs.load_policy import load
-    from experiments.runs.run_dir import Run
     from experiments.training import loop
 
     folder = str(request.policy)

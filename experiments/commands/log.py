@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
 
 from experiments import options
 from experiments.commands import command
 from experiments.errors import ConfigError, error_context
 from experiments.options import argument, option
 from experiments.progress import make_console
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 
 @command(
@@ -55,8 +55,6 @@ def log(
 
 def list_logs(folder: Path, console: Console) -> None:
     """Prints the logs of a folder, oldest first; finished ones are not read through. Raises ConfigError for none."""
-    from rich.table import Table
-
     from robot_io.log.scan import glance
     from robot_io.log.writer import SUFFIX, UNFINISHED
 
@@ -146,8 +144,6 @@ def replay(path: Path, out: Path | None, console: Console) -> None:
     ``out`` becomes a CSV of times [s], captured and replayed positions [rad].
     """
     options.check_exists(path)
-    import numpy as np
-
     from robot_io.emulator import capture as captures
     from robot_io.emulator.arm import ArmParams
 

@@ -136,8 +136,7 @@ def pack(
     /,
     *,
     out: Annotated[
-        Path | None,
-        option("FILE", "default: the run's name with .mjxtt.zip, in the current folder", suffixed(".zip")),
+        Path | None, option("FILE", "default: the run's name with .mjxtt.zip, in the current folder", suffixed(".zip"))
     ] = None,
     licence: Annotated[str | None, option("NAME", "for the card, such as CC-BY-4.0")] = None,
 ) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
 
 from experiments import options
 from experiments.commands import command
@@ -15,9 +17,6 @@ from experiments.errors import ConfigError
 from experiments.interrupts import interruptible
 from experiments.options import argument, count, option
 from experiments.progress import make_console
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 
 @command(
@@ -105,8 +104,6 @@ def blind(
 ) -> None:
     """Lets people evaluate policies under code names."""
     options.start_jax()
-    from rich.table import Table
-
     from experiments.study import blind_protocol
     from experiments.study.analysis import scoring
     from experiments.study.analysis.statistics import t_mean

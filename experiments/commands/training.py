@@ -119,8 +119,7 @@ def compare(
     out: options.RunsFolder = Path("runs"),
     overrides: options.Overrides = (),
     processes: Annotated[
-        int | None,
-        count("trainings at a time (default: one for a budget of minutes, else one per processor core)"),
+        int | None, count("trainings at a time (default: one for a budget of minutes, else one per processor core)")
     ] = None,
     site: options.Site = None,
 ) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
 from experiments import options
@@ -12,6 +15,7 @@ from experiments.commands import group
 from experiments.errors import ConfigError, error_context
 from experiments.options import argument, existing, option, suffixed
 from experiments.progress import make_console, print_stages
+from experiments.runs.locate import artefact_of
 
 if TYPE_CHECKING:
     from robot_io.vision.rig import CameraRig
@@ -72,7 +76,6 @@ def render(
     options.check_writable(out)
     options.start_jax()
     import cv2
-    import numpy as np
 
     from experiments.vision import clips, evaluation, flights
     from experiments.vision.crops import SEEN
@@ -104,8 +107,6 @@ def record(
 ) -> None:
     """Records rendered flights as raw frames; each camera's labels go beside them, as OUT.CAMERA.csv."""
     options.start_jax()
-    import numpy as np
-
     from experiments.vision import clips, evaluation
     from experiments.vision.crops import SEEN
     from experiments.vision.flights import fly_balls
@@ -163,8 +164,6 @@ def train(
     """Trains the detector from nothing: rendered crops, network, hard negatives, covariance, export."""
     options.check_writable(out)
     options.start_jax()
-    from dataclasses import replace
-
     from experiments.vision import pipeline
 
     screen = make_console()
@@ -205,8 +204,6 @@ def evaluate(
             screen.print("guided" if guided else "search", *found.lines(), sep="\n  ")
         return
     options.start_jax()
-    import numpy as np
-
     from experiments.vision.flights import fly_balls
 
     cameras, tracks = read_rig(rig).cameras, fly_balls(flights, seed)
@@ -235,8 +232,6 @@ def calibrate(
     detector: Detector = None,
 ) -> None:
     """Calibrates the rig's cameras by the table's lines and flying balls; --rig says roughly where they stand."""
-    from dataclasses import replace
-
     from experiments.vision.calibration import solve, watch
     from robot_io.vision import rig as rigs
     from robot_io.vision.detector import Detector as BallDetector
@@ -292,8 +287,6 @@ def check(
         screen.print(*summary.lines(), "nothing is wrong" if not summary.problems else "", sep="\n")
         return
     options.start_jax()
-    import numpy as np
-
     from experiments.vision import evaluation, tracking
     from experiments.vision.flights import fly_balls
 
@@ -315,8 +308,6 @@ def run(
     detector: Detector = None,
 ) -> None:
     """Runs the tracker: a process for each camera, datagrams to the bridge, and what is wrong as it happens."""
-    import time
-
     from robot_io.vision import live, sources
 
     described, folder, screen = read_rig(rig), find_detector(detector), make_console()
@@ -331,7 +322,7 @@ def run(
         ]
     else:
         options.check_exists(source)
-        start = time.monotonic() + live.START
+        start = monotonic() + live.START
         opened = [sources.RecordedSource(source, camera.name, True, start) for camera in described.cameras]
     with error_context(source):
         try:
@@ -355,7 +346,6 @@ def rally(
 ) -> None:
     """Plays on the emulated robot by what rendered cameras see, in lock-step."""
     options.start_jax()
-    from experiments.runs.locate import artefact_of
     from experiments.vision import evaluation
     from experiments.vision import rally as rallies
     from robot_io.policy.artefact import load

@@ -33,7 +33,7 @@ class Setup:
     prepare    "module:function", called once in each worker with ``given``; returns the function that does a job. Its
                module is loaded when the worker has its cores, which libraries count when they load
     devices    host devices of a worker, the least that its jobs need
-    cache      folder of compiled programs; None: JAX keeps none
+    cache      folder of compiled programs; None: the user's
     """
 
     prepare: str
@@ -66,7 +66,7 @@ class Job:
 
 
 class Engine:
-    """Does jobs in workers, which see this process's heartbeat. ``engines`` has the two kinds.
+    """Does jobs in workers, which see this process's heartbeat. ``site`` has the two kinds.
 
     slots: jobs that it takes at a time
     replaces: another worker goes on with the job of one that was ended

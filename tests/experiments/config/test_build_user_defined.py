@@ -124,10 +124,7 @@ def test_it_is_fine_tuned_on_the_emulated_robot(trained):
     [
         ({"network": "cnn"}, "network: expected one of gru, got cnn"),
         ({"task.rewards": "{calm: 1}"}, "task: rewards: calm is no reward term; allowed: .*calm_wrist, deep"),
-        (
-            {"definitions": "null"},
-            "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions",
-        ),
+        ({"definitions": "null"}, "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions"),
     ],
 )
 def test_mistakes_in_the_yaml_are_named(folder, changes, says):

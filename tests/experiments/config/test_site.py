@@ -25,14 +25,8 @@ def write(folder, data):
 @pytest.mark.parametrize(
     "data, message",
     [
-        (
-            SLURM | {"worker_per_node": 2},
-            r"worker_per_node: expected .*; did you mean 'workers_per_node'\?",
-        ),
-        (
-            SLURM | {"provider": {"kind": "slurn"}},
-            r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'",
-        ),
+        (SLURM | {"worker_per_node": 2}, r"worker_per_node: expected .*; did you mean 'workers_per_node'\?"),
+        (SLURM | {"provider": {"kind": "slurn"}}, r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'"),
         (
             SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
             r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got '90'",
