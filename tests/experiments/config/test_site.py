@@ -9,7 +9,7 @@ import yaml
 
 from experiments.config import site
 from experiments.errors import ConfigError
-from experiments.jobs import engines
+from experiments.jobs.site import accelerators
 
 CORES = len(os.sched_getaffinity(0))
 SLURM = {"provider": {"kind": "slurm", "walltime": "01:30:00"}, "workers_per_node": 16}
@@ -45,5 +45,5 @@ def test_a_mistake_is_named(tmp_path, data, message):
 
 def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
     two = site.load(write(tmp_path, SLURM | {"workers_per_node": 2, "accelerators_per_worker": 2}))
-    assert engines.accelerators(two) == ["0,1", "2,3"]
-    assert engines.accelerators(site.load(write(tmp_path, SLURM))) == []
+    assert accelerators(two) == ["0,1", "2,3"]
+    assert accelerators(site.load(write(tmp_path, SLURM))) == []
