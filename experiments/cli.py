@@ -1,74 +1,24 @@
-"""The command line ``mjx-tt``: its commands, and what it does with their ends and errors."""
+"""The command line ``mjx-tt``: what it does with its commands' ends and errors."""
 
 from __future__ import annotations
 
 import sys
-from importlib import metadata
+from importlib import import_module
 from typing import NoReturn
 
-from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
+from cyclopts import CycloptsError
 
 from experiments import interrupts
-from experiments.commands import (
-    balls,
-    bench_ball,
-    blind,
-    calibrate,
-    compare,
-    curves,
-    diagnose,
-    evaluate,
-    export,
-    finetune,
-    fit_human,
-    import_,
-    is2r,
-    log,
-    pack,
-    predict,
-    render,
-    rig,
-    robot,
-    run,
-    schema,
-    study_report,
-    train,
-    unpack,
-    view,
-    vision,
-)
+from experiments.commands import app
 from experiments.errors import explained
-from experiments.robots import command as robot_command
 
-DESCRIPTION = """\
-From measured human balls to a trained, evaluated and exported table-tennis policy.
-
-The usual way:
-  mjx-tt balls                          which players and distributions there are
-  mjx-tt train quickstart.yaml          train, evaluate, export: everything lands in runs/quickstart/
-  mjx-tt evaluate runs/quickstart       play it again, on other balls if you like
-  mjx-tt fit-human rallies.csv --out anna.yaml     a distribution of your own, for an experiment's key "balls"
-"""
-WIDTH = 120  # [characters] of help in a file or pipe
-MODULES = (
-    *(train, evaluate, export, pack, unpack, fit_human, import_, render, view, curves, run, finetune, is2r),
-    *(study_report, blind, compare, robot, rig, log, calibrate, diagnose, predict, bench_ball, vision, schema, balls),
-)
-COMMANDS = tuple(module.app for module in MODULES)
-app = App(
-    "mjx-tt",
-    help=DESCRIPTION,
-    help_format="plaintext",
-    console=Console(width=None if sys.stdout.isatty() else WIDTH),
-    version=lambda: metadata.version("mjx-tt"),
-    default_parameter=Parameter(negative=(), show_default=False),
-)
-for _command in (robot_command.new_app, robot_command.place_app, robot_command.list_app):
-    robot.app.command(_command)
-for _place, _command in enumerate(COMMANDS):
-    _command.sort_key = _place
-    app.command(_command)
+for _module in ("training", "policies", "balls", "study", "robot", "log", "calibrate", "diagnose", "vision"):
+    import_module(f"experiments.commands.{_module}")
+COMMANDS = tuple(app[name] for name in app if not name.startswith("-"))
+EXTRAS = {
+    **{"cv2": "vision", "av": "vision", "viser": "view", "mjviser": "view"},
+    **{"pyarrow": "lerobot", "dpkt": "capture", "parsl": "cluster"},
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -83,6 +33,11 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         print(str(interruption) or "interrupted", file=sys.stderr)
         return 130
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        print(f"mjx-tt: error: {error.name} is missing: pip install 'mjx-tt[{EXTRAS[error.name]}]'", file=sys.stderr)
+        return 1
     except Exception as error:
         if not explained(error):
             raise

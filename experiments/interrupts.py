@@ -7,19 +7,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 PATIENCE = 1.0  # [s] for a Ctrl-C to reach its handler
-_handled = threading.Event()
+_handled = threading.Event()  # a Ctrl-C has reached its handler
 _interrupted = threading.Event()
-
-
-def mark_handled() -> None:
-    """Tells ``interruptible`` that a Ctrl-C has reached its handler."""
-    _handled.set()
 
 
 @contextmanager
@@ -29,7 +24,7 @@ def interruptible() -> Iterator[None]:
     Python runs handlers between its own instructions, so a compilation delays them by minutes. Not for programs that
     move a robot: the end is that of a killed process.
     """
-    if not _is_main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     reading, writing = os.pipe()
@@ -37,7 +32,7 @@ def interruptible() -> Iterator[None]:
     handler = signal.getsignal(signal.SIGINT)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        mark_handled()
+        _handled.set()
         if callable(handler):
             handler(number, frame)
 
@@ -66,26 +61,43 @@ def stop_requested(*numbers: signal.Signals, message: str = "") -> Iterator[thre
     numbers: which signals, Ctrl-C by default; message: answers a Ctrl-C.
     """
     requested = threading.Event()
-    if not _is_main_thread():
-        yield requested
-        return
 
     def request(number: int, _frame: FrameType | None) -> None:
-        mark_handled()
+        _handled.set()
         requested.set()
         if message and number == signal.SIGINT:
-            write_line(message)
-        signal.signal(number, before[signal.Signals(number)])
+            _write_line(message)
+        signal.signal(number, before[number])
 
-    before = {number: signal.signal(number, request) for number in numbers or (signal.SIGINT,)}
-    try:
+    with _handlers(request, *numbers or (signal.SIGINT,)) as before:
         yield requested
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Inside, SIGTERM is a Ctrl-C, also for a worker's job."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    with _handlers(interrupt, signal.SIGTERM):
+        yield
+
+
+@contextmanager
+def _handlers(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[dict[int, Any]]:
+    """Inside, signals have this handler, except in threads that may set none; yields the handlers from before."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield before
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
-def write_line(text: str) -> None:
+def _write_line(text: str) -> None:
     """Writes a line to stderr; safe in a signal handler."""
     with contextlib.suppress(OSError):
         os.write(2, f"\n{text}\n".encode())
@@ -100,20 +112,15 @@ def end_process(status: int) -> NoReturn:
     sys.exit(status)
 
 
-def _is_main_thread() -> bool:
-    """False where Python allows nobody to set handlers."""
-    return threading.current_thread() is threading.main_thread()
-
-
 def _watch(reading: int) -> None:
     waiting = False  # for a Ctrl-C to reach its handler
     while received := os.read(reading, 1):
         if received[0] != signal.SIGINT:
             continue
         if waiting and not _handled.is_set():
-            write_line("ended at once; the same command continues from what is saved")
+            _write_line("ended at once; the same command continues from what is saved")
             os._exit(130)
         waiting = not _handled.wait(PATIENCE)
         if waiting:
-            write_line("Ctrl-C: stops when the present compilation or computation is done; Ctrl-C again ends at once")
+            _write_line("Ctrl-C: stops when the present compilation or computation is done; Ctrl-C again ends at once")
         _handled.clear()

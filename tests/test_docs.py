@@ -139,9 +139,10 @@ def test_links_of_pages_outside_of_the_documentation_exist():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_of_a_page_are_accepted(page):
-    from experiments import cli
+def test_commands_of_a_page_are_accepted(page, monkeypatch):
+    from experiments import cli, options
 
+    monkeypatch.setattr(options, "check_exists", lambda *_, key="": None)  # the files that a page speaks of
     refused = []
     for command in (line for _, block in FENCED.findall(text_of(page)) for line in COMMAND.findall(block)):
         try:

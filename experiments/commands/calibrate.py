@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
+from rich.console import Console
 
+from ballmodel.constants import PADDLE_RADIUS
 from experiments import options
+from experiments.commands import command
+from experiments.config.files import read_yaml
 from experiments.errors import ConfigError, error_context
-from experiments.options import option
+from experiments.options import argument, existing, option
+from experiments.progress import make_console
+from experiments.runs import run_dir
+from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
+from robot_io.contract import PAPER
 
-if TYPE_CHECKING:
-    import numpy as np
-    from rich.console import Console
 
-    from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
-    from robot_io.contract import Contract
-
-app = options.command(
+@command(
     "calibrate",
-    "calibrate tracker, robot and clock from measured points and logs",
     """\
   mjx-tt calibrate tracker ball.csv              table_x, table_y, table_z and ball_x, ball_y, ball_z of every point
   mjx-tt calibrate robot touches.csv --robot robot.yaml        table_x, ... and gantry_x ... joint_6 of every touch
@@ -31,63 +35,52 @@ Writes calibration.yaml, each part beside the others; robot.yaml names it: "cali
 mjx-tt robot check writes the ball's columns of the points, robot jog the joints' as well; the table's are yours.
 """,
 )
-
-
-@app.default
 def calibrate(
     part: Annotated[Literal["tracker", "robot", "clock"], Parameter("PART")],
-    source: Annotated[str, Parameter("FILE", help="CSV of points, or the log of a session")],
+    source: Annotated[Path, argument("FILE", "CSV of points, or the log of a session", existing())],
     name: Annotated[
         str | None, Parameter("ROBOT", help="robot: the installed one, by folder or name (default: the paper's)")
     ] = None,
     /,
     *,
-    robot: Annotated[str | None, option("YAML", "robot.yaml whose axis zeros are stored with the robot's")] = None,
-    out: Annotated[str, option("YAML", "calibration to write or extend")] = "calibration.yaml",
-) -> int:
-    """Returns the exit status."""
-    options.check_exists(source, robot)
+    robot: Annotated[
+        Path | None, option("YAML", "robot.yaml whose axis zeros are stored with the robot's", existing("--robot"))
+    ] = None,
+    out: Annotated[Path, option("YAML", "calibration to write or extend")] = Path("calibration.yaml"),
+) -> None:
+    """Calibrates tracker, robot and clock from measured points and logs."""
     if name is not None and part != "robot":
         raise ConfigError(f"{name}: the {part}'s calibration is of no robot; allowed with calibrate robot")
-    target = Path(out)
-    options.check_writable(target.parent)
-    from dataclasses import asdict
-    from datetime import date
-
+    options.check_writable(out.parent)
     from experiments.config import robot as robots
-    from experiments.progress import make_console
-    from experiments.runs import run_dir
-    from robot_io.calibrated import Calibration
-    from robot_io.contract import PAPER
-    from robot_io.control.config import RobotConfig
 
-    path, today, screen = Path(source), date.today().isoformat(), make_console()
-    known = robots.load_calibration(target) if target.exists() else Calibration()
+    screen = make_console()
+    known = robots.load_calibration(out) if out.exists() else Calibration()
     found: TrackerCalibration | RobotCalibration | ClockCalibration
     if part == "tracker":
-        found = _tracker(path, today, screen)
+        found = _tracker(source, screen)
     elif part == "robot":
-        name = name or (robots.named(robot) if robot else None)
-        contract, end = (PAPER, None) if name is None else _load_standing(name)
-        config = robots.load_robot(robot, False, contract) if robot else RobotConfig.of(contract)
-        found = _robot(path, tuple(axis.zero for axis in config.axes), today, screen, contract, end)
+        found = _robot(source, name, robot, screen)
     else:
-        found = _clock(path, known, today, screen)
+        found = _clock(source, known, screen)
     # What run would refuse is not written.
-    known = robots.fill(Calibration, robots.plain(known) | {part: asdict(found)}, str(target))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    run_dir.write_yaml(target, robots.plain(known))
-    screen.print(f"{target}: {part} written; robot.yaml names it: calibration: {target.name}")
-    return 0
+    known = robots.fill(Calibration, robots.plain(known) | {part: asdict(found)}, str(out))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    run_dir.write_yaml(out, robots.plain(known))
+    screen.print(f"{out}: {part} written; robot.yaml names it: calibration: {out.name}")
 
 
-def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
+def _today() -> str:
+    return date.today().isoformat()
+
+
+def _tracker(path: Path, screen: Console) -> TrackerCalibration:
     from robot_io.calibration import points, tracker
 
     with error_context():
         lines, (table, seen) = points.read(path, points.TABLE, points.BALL)
     with error_context(str(path)):
-        fit = tracker.fit(table, seen, today)
+        fit = tracker.fit(table, seen, _today())
     _show_points(screen, path, lines, fit.residuals, fit.used)
     position, turn = 1e3 * fit.deviation[:3], 1e3 * fit.deviation[3:]
     screen.print(
@@ -97,32 +90,27 @@ def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
     return fit.calibration
 
 
-def _load_standing(name: str) -> tuple[Contract, np.ndarray | None]:
-    """Contract of a robot by its folder or name, and the end (3,) [m] of its blade in the last joint's frame.
-
-    Raises ConfigError.
-    """
-    from ballmodel.constants import PADDLE_RADIUS
-    from mjx_tt.robot import robots
-    from robot_io.contract import PAPER
-
-    with error_context():
-        robot = robots.load(name)
-    if robot.contract == PAPER:
-        return PAPER, None
-    frame = robot.paddle()
-    return robot.contract, frame.pos - robot.chain().links[-1].anchor + PADDLE_RADIUS * frame.rot[:, 0]
-
-
-def _robot(
-    path: Path, zeros: tuple[float, ...], today: str, screen: Console, contract: Contract, end: np.ndarray | None
-) -> RobotCalibration:
+def _robot(path: Path, name: str | None, installed: Path | None, screen: Console) -> RobotCalibration:
+    """Of the robot of that name or in that folder; None: the one that robot.yaml, ``installed``, names."""
+    from experiments.config import robot as robots
+    from mjx_tt.robot import robots as simulated
     from robot_io.calibration import points, robot
+    from robot_io.control.config import RobotConfig
 
+    name = name or (robots.named(installed) if installed else None)
+    contract, end = PAPER, None  # end (3,) [m] of the blade in the last joint's frame
+    if name is not None:
+        with error_context():
+            standing = simulated.load(name)
+        if standing.contract != PAPER:
+            frame, contract = standing.paddle(), standing.contract
+            end = frame.pos - standing.chain().links[-1].anchor + PADDLE_RADIUS * frame.rot[:, 0]
+    config = robots.load_robot(installed, False, contract) if installed else RobotConfig.of(contract)
     with error_context():
         lines, table, joints, paddle = points.touched(path, contract, end)
     with error_context(str(path)):
-        fit = robot.fit(table, joints, paddle, zeros, today, contract)
+        zeros = tuple(axis.zero for axis in config.axes)
+        fit = robot.fit(table, joints, paddle, zeros, _today(), contract)
     _show_points(screen, path, lines, fit.residuals, fit.used)
     found = fit.calibration
     values = (*found.joint_zeros, *found.base_position, *found.base_rotation, *found.tip)
@@ -135,11 +123,9 @@ def _robot(
     return found
 
 
-def _clock(path: Path, known: Calibration, today: str, screen: Console) -> ClockCalibration:
+def _clock(path: Path, known: Calibration, screen: Console) -> ClockCalibration:
     from experiments.config import robot as robots
-    from experiments.config.files import read_yaml
     from robot_io import log
-    from robot_io.calibrated import Calibration
     from robot_io.calibration import clock
 
     with error_context():
@@ -149,7 +135,7 @@ def _clock(path: Path, known: Calibration, today: str, screen: Console) -> Clock
         where = f"{path}: calibration.yaml"
         known = robots.fill(Calibration, read_yaml(then.decode(), where) or {}, where)
     with error_context(str(path)):
-        found, told = clock.fit(session, known, today)
+        found, told = clock.fit(session, known, _today())
     for line in told:
         screen.print(line)
     return found

@@ -11,23 +11,57 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
+from rich.console import Console
 
 from experiments import options
+from experiments.commands import command
 from experiments.errors import ConfigError, error_context
-from experiments.options import option
+from experiments.options import argument, option
+from experiments.progress import make_console
+from experiments.runs.run_dir import Run
+from robot_io.contract import Contract
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from experiments.runs.load_policy import TrainedPolicy
     from mjx_tt import diagnosis
     from mjx_tt.diagnosis.report import Play, Rate
     from mjx_tt.robot.robots import Robot
-    from robot_io.contract import Contract
 
-app = options.command(
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What is judged, and how."""
+
+    out: Annotated[Path, option("DIR", "where report, verdict and extended model go")]
+    model: Annotated[str | None, option("YAML", "the model to judge (default: the nominal one)")] = None
+    spin: Annotated[
+        Literal["auto", "none", "free"],
+        Parameter(help="whether balls may spin (auto: free where the model has a Magnus force, else a possible cause)"),
+    ] = "auto"
+    without: Annotated[tuple[str, ...], option("NAMES", "effects to leave out of the catalogue")] = ()
+    home: Annotated[str, option("POSE", "pose before the first motion: home, or joint_1=0.52,gantry_x=0 [rad, m]")] = ""
+    randomise: Annotated[bool, Parameter(help="randomise in extended.yaml what the logs do not determine")] = False
+    seed: Annotated[int, Parameter(help="seed of the bootstrap (default: 0)", validator=Number(gte=0))] = 0
+    policy: Annotated[str | None, option("POLICY", "a run or artefact: measure what the defect costs in play")] = None
+    robot: Annotated[str | None, option("FOLDER", "robot whose joints were logged (default: the paper's)")] = None
+    retrain: Annotated[
+        int, option("UPDATES", "with --policy: retrain for so many updates under the extended model", Number(gte=0))
+    ] = 0
+    episodes: Annotated[int, Parameter(help="balls of each evaluation (default: 2000)")] = 2000
+    tracks: options.TrackFileOptions = options.TRACKS
+
+    def load_robot(self) -> Robot:
+        """The robot whose joints were logged. Raises ConfigError."""
+        from mjx_tt.robot import robots
+
+        with error_context("--robot"):
+            return robots.paper() if self.robot is None else robots.load(self.robot)
+
+
+@command(
     "diagnose",
-    "find what the simulation gets wrong about measured logs",
     """\
   mjx-tt diagnose session1.csv session2.mcap --out diagnosis
   mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
@@ -40,80 +74,37 @@ CSV, JSON, NumPy, Parquet, MCAP, ROS bag or the launcher's HDF5; robot logs: com
 state.csv (t,joint,position).
 """,
 )
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What is judged, and how."""
-
-    out: Annotated[str, option("DIR", "where report, verdict and extended model go")]
-    model: Annotated[str | None, option("YAML", "the model to judge (default: the nominal one)")] = None
-    spin: Annotated[
-        Literal["auto", "none", "free"],
-        Parameter(help="whether balls may spin (auto: free where the model has a Magnus force, else a possible cause)"),
-    ] = "auto"
-    without: Annotated[tuple[str, ...], option("NAMES", "effects to leave out of the catalogue")] = ()
-    home: Annotated[str, option("POSE", "pose before the first motion: home, or joint_1=0.52,gantry_x=0 [rad, m]")] = ""
-    randomise: Annotated[bool, Parameter(help="randomise in extended.yaml what the logs do not determine")] = False
-    seed: Annotated[int, Parameter(help="seed of the bootstrap (default: 0)")] = 0
-    policy: Annotated[str | None, option("POLICY", "a run or artefact: measure what the defect costs in play")] = None
-    robot: Annotated[str | None, option("FOLDER", "robot whose joints were logged (default: the paper's)")] = None
-    retrain: Annotated[
-        int, option("UPDATES", "with --policy: retrain for so many updates under the extended model")
-    ] = 0
-    episodes: Annotated[int, Parameter(help="balls of each evaluation (default: 2000)")] = 2000
-    tracks: options.TrackFileOptions = options.TRACKS
-
-    def load_robot(self) -> Robot:
-        """The robot whose joints were logged. Raises ConfigError."""
-        from mjx_tt.robot import robots
-
-        with error_context("--robot"):
-            return robots.paper() if self.robot is None else robots.load(self.robot)
-
-    def check(self) -> None:
-        """Refuses at once a request that would fail after the work. Raises ConfigError."""
-        if self.seed < 0:
-            raise ConfigError(f"--seed {self.seed}: a whole number from 0 on is wanted")
-        if self.retrain and self.policy is None:
-            raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
-        if self.retrain < 0:
-            raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
-        if self.policy is not None:
-            from experiments.runs.load_policy import load
-
-            options.PLAY.experiment(load(self.policy))
-        resting_pose(self.home, self.load_robot())
-        options.check_writable(self.out)
-
-
-@app.default
-def diagnose(
-    *logs: Annotated[str, Parameter("LOG", help="a file, or a folder of files", required=True)], request: Request
-) -> None:
-    """Writes report, verdict and extended model."""
-    options.start_jax(1)
-    from experiments.progress import make_console
+def diagnose(*logs: Annotated[str, argument("LOG", "a file, or a folder of files")], request: Request) -> None:
+    """Finds what the simulation gets wrong about measured logs."""
+    options.start_jax()
+    from experiments.runs.load_policy import load
     from mjx_tt.diagnosis import report
 
-    screen, folder = make_console(), Path(request.out)
-    request.check()
+    # What would fail after the work is refused at once.
+    if request.retrain and request.policy is None:
+        raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
+    if request.policy is not None:
+        options.PLAY.experiment(load(request.policy))
+    robot = request.load_robot()
+    resting_pose(request.home, robot)
+    options.check_writable(request.out)
+    screen, folder = make_console(), request.out
     found = run(logs, request, screen)
-    extended = save(found, folder)
-    show(found, screen, request.load_robot().contract)
-    cost = play(extended, request, screen) if request.policy else None
+    folder.mkdir(parents=True, exist_ok=True)
+    found.verdict.save(folder / "verdict.json")
+    found.extended.save(folder / "extended.yaml")
+    if found.balls is not None and found.balls.spins is not None:
+        found.balls.spins.save(folder / "spins.csv")
+    show(found, screen, robot.contract)
+    cost = play(folder / "extended.yaml", request, screen) if request.policy else None
     report.write_report(folder, found, ", ".join(Path(p).name for p in logs), cost)
     for name in ("report.html", "verdict.json", "extended.yaml", "spins.csv"):
         if (folder / name).exists():
             screen.print(f"  {folder / name}")
 
 
-def resting_pose(text: str, robot: Robot | None = None) -> dict[str, float]:
+def resting_pose(text: str, robot: Robot) -> dict[str, float]:
     """Positions [rad], [m] by joint: the robot's home pose, or pairs joint=position. Raises ConfigError."""
-    from mjx_tt.robot import robots
-
-    robot = robots.paper() if robot is None else robot
     joints = robot.contract.joints
     if text in ("", "home"):
         return dict(zip(joints, robot.home.tolist(), strict=True)) if text else {}
@@ -216,7 +207,6 @@ def play(extended: Path, request: Request, console: Console) -> Play:
     from experiments.config import build
     from experiments.evaluation import evaluate
     from experiments.runs.load_policy import load
-    from experiments.runs.run_dir import Run
     from experiments.training import loop
 
     folder = str(request.policy)
@@ -249,22 +239,10 @@ def play(extended: Path, request: Request, console: Console) -> Play:
     return rates
 
 
-def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
-    """Writes verdict.json and extended.yaml; returns the path of the latter."""
-    folder.mkdir(parents=True, exist_ok=True)
-    found.verdict.save(folder / "verdict.json")
-    found.extended.save(folder / "extended.yaml")
-    if found.balls is not None and found.balls.spins is not None:
-        found.balls.spins.save(folder / "spins.csv")
-    return folder / "extended.yaml"
-
-
-def show(found: diagnosis.Diagnosis, console: Console, contract: Contract | None = None) -> None:
-    """Prints the verdict in a few lines; contract: of the robot that was logged, None: the paper's."""
+def show(found: diagnosis.Diagnosis, console: Console, contract: Contract) -> None:
+    """Prints the verdict in a few lines; contract: of the robot that was logged."""
     from mjx_tt.diagnosis.report import text
-    from robot_io.contract import PAPER
 
-    contract = contract or PAPER
     v, units = found.verdict, dict(zip(contract.joints, contract.units, strict=True))
     console.print(f"verdict: {v.verdict}", style="bold")
     for warning in v.warnings:

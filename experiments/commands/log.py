@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib.util import find_spec
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
 
 from experiments import options
+from experiments.commands import command
 from experiments.errors import ConfigError, error_context
-from experiments.options import option
+from experiments.options import argument, option
+from experiments.progress import make_console
 
-if TYPE_CHECKING:
-    from rich.console import Console
 
-app = options.command(
+@command(
     "log",
-    "list, check, salvage or export the logs of a robot; replay a capture of its arm",
     """\
   mjx-tt log list runs/robot
   mjx-tt log check runs/robot/20261121-153000.mcap
@@ -29,48 +30,39 @@ app = options.command(
   mjx-tt log replay arm.pcap --out arm.csv             a real arm's EGM, played to the emulated controller
 """,
 )
-
-
-@app.default
 def log(
     action: Annotated[Literal["list", "check", "salvage", "export", "lerobot", "replay"], Parameter("ACTION")],
     /,
     *paths: Annotated[
-        str,
-        Parameter(
-            "LOG",
-            help="an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder; replay: a pcap",
-            required=True,
-        ),
+        Path,
+        argument("LOG", "an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder; replay: a pcap"),
     ],
-    out: Annotated[str | None, option("PATH", "salvage and replay: the file; export and lerobot: the folder")] = None,
+    out: Annotated[Path | None, option("PATH", "salvage and replay: the file; export and lerobot: the folder")] = None,
 ) -> int:
-    """Returns 1 where a checked log is not sound."""
-    from experiments.progress import make_console
-
-    screen, target = make_console(), Path(out) if out else None
+    """Lists, checks, salvages or exports the logs of a robot; replays a capture of its arm."""
+    screen = make_console()
     if action == "list":
-        list_logs(Path(paths[0]), screen)
+        list_logs(paths[0], screen)
     elif action == "check":
-        return 1 if check([Path(path) for path in paths], screen) else 0
+        return 1 if check(paths, screen) else 0
     elif action == "lerobot":
-        lerobot(paths, target, screen)
-    elif action == "replay":
-        for path in paths:
-            replay(Path(path), target, screen)
+        lerobot(paths, out, screen)
     else:
         for path in paths:
-            (salvage if action == "salvage" else export)(Path(path), target, screen)
+            {"salvage": salvage, "export": export, "replay": replay}[action](path, out, screen)
     return 0
 
 
 def list_logs(folder: Path, console: Console) -> None:
     """Prints the logs of a folder, oldest first; finished ones are not read through. Raises ConfigError for none."""
-    from rich.table import Table
-
     from robot_io.log.scan import glance
+    from robot_io.log.writer import SUFFIX, UNFINISHED
 
-    paths = _logs_in(folder)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    paths = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, UNFINISHED)) and path.is_file()]
+    if not paths:
+        raise ConfigError(f"{folder}: no logs ({SUFFIX} or {UNFINISHED}) in it")
     table = Table("log", "started (UTC)", "duration", "messages", "lost", "state", title_justify="left")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
         with error_context():
@@ -87,7 +79,7 @@ def list_logs(folder: Path, console: Console) -> None:
     console.print(table)
 
 
-def check(paths: list[Path], console: Console) -> int:
+def check(paths: Iterable[Path], console: Console) -> int:
     """Reads logs through, checks every checksum and prints what is wrong; returns how many are not sound."""
     from robot_io import log
 
@@ -131,22 +123,19 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     return written
 
 
-def lerobot(paths: Sequence[str], out: Path | None, console: Console) -> None:
+def lerobot(paths: Sequence[Path], out: Path | None, console: Console) -> None:
     """Writes sessions, or measured balls, as one LeRobot data set, and says what is not in it. Raises ConfigError."""
-    if find_spec("pyarrow") is None:
-        raise ConfigError("log lerobot needs pyarrow: pip install 'mjx-tt[lerobot]'")
     if out is None:
         raise ConfigError("log lerobot needs --out: the folder of the data set")
     options.check_exists(*paths)
     from experiments.sharing import lerobot as data_sets
     from experiments.sharing import recordings
 
-    recording = recordings.read(paths)
+    recording = recordings.read([str(path) for path in paths])
     data_sets.write(recording, out)
     frames = sum(len(episode.columns["next.done"]) for episode in recording.episodes)
-    lines = (f"{out}: {len(recording.episodes):,} episodes, {frames:,} frames at 75 Hz", *recording.notes)
-    for line in lines:
-        console.print(line, soft_wrap=True)
+    made = f"{out}: {len(recording.episodes):,} episodes, {frames:,} frames at 75 Hz"
+    console.print(made, *recording.notes, sep="\n", soft_wrap=True)
 
 
 def replay(path: Path, out: Path | None, console: Console) -> None:
@@ -154,14 +143,10 @@ def replay(path: Path, out: Path | None, console: Console) -> None:
 
     ``out`` becomes a CSV of times [s], captured and replayed positions [rad].
     """
-    if find_spec("dpkt") is None:
-        raise ConfigError("log replay needs dpkt: pip install 'mjx-tt[capture]'")
-    import numpy as np
-
+    options.check_exists(path)
     from robot_io.emulator import capture as captures
     from robot_io.emulator.arm import ArmParams
 
-    options.check_exists(str(path))
     with error_context():
         capture = captures.read(path)
         emulated = captures.replay(capture, ArmParams())
@@ -180,14 +165,3 @@ def replay(path: Path, out: Path | None, console: Console) -> None:
         table = np.column_stack([times, captured, emulated])
         np.savetxt(out, table, fmt="%.12g", delimiter=",", header=",".join(["time", *names]), comments="")
         console.print(f"{out}: times [s] and positions [rad]", soft_wrap=True)
-
-
-def _logs_in(folder: Path) -> list[Path]:
-    from robot_io.log.writer import SUFFIX, UNFINISHED
-
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
-    paths = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, UNFINISHED)) and path.is_file()]
-    if not paths:
-        raise ConfigError(f"{folder}: no logs ({SUFFIX} or {UNFINISHED}) in it")
-    return paths

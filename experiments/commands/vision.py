@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
 from experiments import options
+from experiments.commands import group
 from experiments.errors import ConfigError, error_context
-from experiments.options import option
+from experiments.options import argument, existing, option, suffixed
+from experiments.progress import make_console, print_stages
+from experiments.runs.locate import artefact_of
 
 if TYPE_CHECKING:
     from robot_io.vision.rig import CameraRig
 
-app = options.command(
+app = group(
     "vision",
-    "balls from camera pictures: detector, calibration, tracker",
+    "Finds balls in camera pictures: detector, calibration, tracker.",
     """\
   mjx-tt vision render --out pictures/                  what the cameras see, as PNG with labels
   mjx-tt vision record --out rally.mcap                 a rendered rally as raw frames, losslessly
@@ -32,24 +37,18 @@ app = options.command(
 )
 
 Detector = Annotated[
-    str | None, option("FOLDER", "a trained detector (default: the one that comes with the program)", "--detector")
+    str | None, option("FOLDER", "a trained detector (default: the one that comes with the program)", name="--detector")
 ]
-Rig = Annotated[str | None, option("YAML", "the cameras (default: two as the paper places them)")]
+Rig = Annotated[str | None, option("YAML", "the cameras (default: two as the paper places them)", existing("--rig"))]
 Seed = Annotated[int, option("K", "seed of halls, people, balls and noise (default: 0)")]
 CameraName = Annotated[str | None, option("NAME", "camera of a recording")]
-
-
-def check_extra() -> None:
-    """Raises ConfigError where the extra is not installed."""
-    if find_spec("cv2") is None:
-        raise ConfigError('mjx-tt vision: expected OpenCV, found none; pip install "mjx-tt[vision]"')
+Flights = Annotated[int, options.count("rendered flights (default: 20)")]
 
 
 def read_rig(path: str | None) -> CameraRig:
     """The rig of a YAML, or the one that ships. Raises ConfigError."""
     from robot_io.vision import rig
 
-    options.check_exists(path, key="--rig")
     with error_context():
         return rig.standard() if path is None else rig.read(path)
 
@@ -68,25 +67,22 @@ def find_detector(folder: str | None) -> Path:
 @app.command
 def render(
     *,
-    out: Annotated[str, option("FOLDER", "where the pictures go")],
+    out: Annotated[Path, option("FOLDER", "where the pictures go")],
     count: Annotated[int, options.count("pictures of each camera (default: 8)")] = 8,
     rig: Rig = None,
     seed: Seed = 0,
 ) -> None:
     """Draws what the cameras see: a PNG for each picture, and labels.csv with frame,x,y for each camera."""
-    check_extra()
     options.check_writable(out)
-    options.start_jax(1)
+    options.start_jax()
     import cv2
-    import numpy as np
 
-    from experiments.progress import make_console
     from experiments.vision import clips, evaluation, flights
     from experiments.vision.crops import SEEN
 
     cameras, rng = read_rig(rig).cameras, np.random.default_rng(seed)
     for camera in cameras:
-        (Path(out) / camera.name).mkdir(parents=True, exist_ok=True)
+        (out / camera.name).mkdir(parents=True, exist_ok=True)
     labels: dict[str, clips.Labels] = {camera.name: {} for camera in cameras}
     for number, flight in enumerate(evaluation.play_flights(cameras, flights.fly_balls(count, seed), rng)):
         chosen = int(rng.integers(5, 60))
@@ -94,28 +90,23 @@ def render(
         place = path(np.array([time]))[0]
         for camera, shot in zip(cameras, shots, strict=True):
             picture = cv2.cvtColor(shot.frame, cv2.COLOR_BayerRGGB2BGR)
-            cv2.imwrite(str(Path(out) / camera.name / f"{number}.png"), picture)
+            cv2.imwrite(str(out / camera.name / f"{number}.png"), picture)
             labels[camera.name][number] = camera.project(place) if shot.seen > SEEN else None
     for name, places in labels.items():
-        clips.write_labels(Path(out) / name / "labels.csv", places)
+        clips.write_labels(out / name / "labels.csv", places)
     make_console().print(f"{count} pictures of {', '.join(labels)} in {out}")
 
 
 @app.command
 def record(
     *,
-    out: Annotated[str, option("MCAP", "the recording")],
+    out: Annotated[Path, option("MCAP", "the recording", suffixed(".mcap"))],
     flights: Annotated[int, options.count("balls (default: 3)")] = 3,
     rig: Rig = None,
     seed: Seed = 0,
 ) -> None:
     """Records rendered flights as raw frames; each camera's labels go beside them, as OUT.CAMERA.csv."""
-    check_extra()
-    options.check_suffix(out, ".mcap")
-    options.start_jax(1)
-    import numpy as np
-
-    from experiments.progress import make_console
+    options.start_jax()
     from experiments.vision import clips, evaluation
     from experiments.vision.crops import SEEN
     from experiments.vision.flights import fly_balls
@@ -136,24 +127,20 @@ def record(
                     labels[camera.name][count] = camera.project(place) if seen else None
                 count += 1
     for name, places in labels.items():
-        clips.write_labels(Path(out).with_suffix(f".{name}.csv"), places)
-    screen.print(f"{count} frames of {', '.join(labels)}, {Path(out).stat().st_size / 1e6:.0f} MB: {out}")
+        clips.write_labels(out.with_suffix(f".{name}.csv"), places)
+    screen.print(f"{count} frames of {', '.join(labels)}, {out.stat().st_size / 1e6:.0f} MB: {out}")
 
 
 @app.command
 def label(
-    clip: Annotated[str, Parameter("CLIP", help="a video file or a recording")],
+    clip: Annotated[str, argument("CLIP", "a video file or a recording", existing())],
     /,
     *,
-    out: Annotated[str, option("CSV", "the file to write: frame,x,y")],
+    out: Annotated[Path, option("CSV", "the file to write: frame,x,y", suffixed(".csv"))],
     detector: Detector = None,
     camera: CameraName = None,
 ) -> None:
     """Writes the surest ball of each frame as a label, for a person to correct; frames without one get an empty one."""
-    check_extra()
-    options.check_suffix(out, ".csv")
-    options.check_exists(clip)
-    from experiments.progress import make_console
     from experiments.vision import clips
     from robot_io.vision.detector import Detector as BallDetector
 
@@ -170,23 +157,19 @@ def label(
 @app.command
 def train(
     *,
-    out: Annotated[str, option("FOLDER", "where the detector goes, and its work; resumes there")],
+    out: Annotated[Path, option("FOLDER", "where the detector goes, and its work; resumes there")],
     small: Annotated[bool, Parameter(help="a try-out of a minute, whose detector is poor")] = False,
     seed: Seed = 0,
 ) -> None:
     """Trains the detector from nothing: rendered crops, network, hard negatives, covariance, export."""
-    check_extra()
     options.check_writable(out)
-    options.start_jax(1)
-    from dataclasses import replace
-
-    from experiments.progress import make_console, print_stages
+    options.start_jax()
     from experiments.vision import pipeline
 
     screen = make_console()
     plan = replace(pipeline.Plan.small() if small else pipeline.Plan(), seed=seed)
     with error_context():
-        figures = pipeline.train_detector(Path(out), plan, print_stages(screen, "vision"), screen.print)
+        figures = pipeline.train_detector(out, plan, print_stages(screen, "vision"), screen.print)
     screen.print(*(f"  {name:<10}{value:.4f}" for name, value in figures.items()), sep="\n")
 
 
@@ -201,14 +184,12 @@ def evaluate(
     detector: Detector = None,
     within: Annotated[float, option("PX", "distance from a label that counts as found (default: 10)")] = 10.0,
     camera: CameraName = None,
-    flights: Annotated[int, options.count("rendered flights (default: 20)")] = 20,
+    flights: Flights = 20,
     empty: Annotated[float | None, option("S", "also S seconds of rendered play without a ball")] = None,
     rig: Rig = None,
     seed: Seed = 1000,
 ) -> None:
     """Counts what the detector finds, searching alone and guided by where the ball was."""
-    check_extra()
-    from experiments.progress import make_console
     from experiments.vision import clips, evaluation
 
     folder, screen = find_detector(detector), make_console()
@@ -222,9 +203,7 @@ def evaluate(
             found = evaluation.evaluate_clip(folder, opened, known, guided, within)
             screen.print("guided" if guided else "search", *found.lines(), sep="\n  ")
         return
-    options.start_jax(1)
-    import numpy as np
-
+    options.start_jax()
     from experiments.vision.flights import fly_balls
 
     cameras, tracks = read_rig(rig).cameras, fly_balls(flights, seed)
@@ -242,21 +221,17 @@ def evaluate(
 
 @app.command
 def calibrate(
-    recording: Annotated[str, Parameter("MCAP", help="a recording of all cameras: the cleared table, then balls")],
+    recording: Annotated[
+        Path, argument("MCAP", "a recording of all cameras: the cleared table, then balls", existing())
+    ],
     /,
     *,
-    out: Annotated[str, option("YAML", "the calibrated rig; may be the file of --rig")],
+    out: Annotated[Path, option("YAML", "the calibrated rig; may be the file of --rig", suffixed(".yaml"))],
     bumped: Annotated[str | None, option("CAMERA", "only this camera's pose has changed")] = None,
     rig: Rig = None,
     detector: Detector = None,
 ) -> None:
     """Calibrates the rig's cameras by the table's lines and flying balls; --rig says roughly where they stand."""
-    check_extra()
-    options.check_exists(recording)
-    options.check_suffix(out, ".yaml")
-    from dataclasses import replace
-
-    from experiments.progress import make_console
     from experiments.vision.calibration import solve, watch
     from robot_io.vision import rig as rigs
     from robot_io.vision.detector import Detector as BallDetector
@@ -265,8 +240,8 @@ def calibrate(
     names = [camera.name for camera in described.cameras]
     if bumped is not None and bumped not in names:
         raise ConfigError(f"--bumped: expected one of {', '.join(names)}, got {bumped!r}")
-    with error_context(recording):
-        stills = watch.read_stills(Path(recording), described)
+    with error_context(str(recording)):
+        stills = watch.read_stills(recording, described)
         lens = bumped is None
         fitted = [
             solve.fit_edges(still, camera, lens) if bumped in (None, camera.name) else solve.see_edges(still, camera)
@@ -274,7 +249,7 @@ def calibrate(
         ]
         rough = replace(described, cameras=tuple(camera for camera, _ in fitted))
         detectors = [BallDetector(folder, described.rate, bayer=described.bayer) for _ in names]
-        moments = watch.detect_all(watch.pair_frames(Path(recording), described), detectors)
+        moments = watch.detect_all(watch.pair_frames(recording, described), detectors)
         flights = watch.find_flights(moments, rough)
         if bumped is not None and len(flights) < solve.FEWEST_FLIGHTS:
             flights = []
@@ -297,13 +272,10 @@ def check(
     *,
     rig: Rig = None,
     detector: Detector = None,
-    flights: Annotated[int, options.count("rendered flights (default: 20)")] = 20,
+    flights: Flights = 20,
     seed: Seed = 1000,
 ) -> None:
     """Says what is wrong with a recording's cameras, or how well rendered flights are tracked."""
-    check_extra()
-    from experiments.progress import make_console
-
     described, folder, screen = read_rig(rig), find_detector(detector), make_console()
     if recording is not None:
         options.check_exists(recording)
@@ -314,9 +286,7 @@ def check(
             summary = live.run(described, recorded, folder, None, screen.print, live=False)
         screen.print(*summary.lines(), "nothing is wrong" if not summary.problems else "", sep="\n")
         return
-    options.start_jax(1)
-    import numpy as np
-
+    options.start_jax()
     from experiments.vision import evaluation, tracking
     from experiments.vision.flights import fly_balls
 
@@ -338,10 +308,6 @@ def run(
     detector: Detector = None,
 ) -> None:
     """Runs the tracker: a process for each camera, datagrams to the bridge, and what is wrong as it happens."""
-    check_extra()
-    import time
-
-    from experiments.progress import make_console
     from robot_io.vision import live, sources
 
     described, folder, screen = read_rig(rig), find_detector(detector), make_console()
@@ -356,7 +322,7 @@ def run(
         ]
     else:
         options.check_exists(source)
-        start = time.monotonic() + live.START
+        start = monotonic() + live.START
         opened = [sources.RecordedSource(source, camera.name, True, start) for camera in described.cameras]
     with error_context(source):
         try:
@@ -379,10 +345,7 @@ def rally(
     seed: Seed = 0,
 ) -> None:
     """Plays on the emulated robot by what rendered cameras see, in lock-step."""
-    check_extra()
-    options.start_jax(1)
-    from experiments.progress import make_console
-    from experiments.runs.locate import artefact_of
+    options.start_jax()
     from experiments.vision import evaluation
     from experiments.vision import rally as rallies
     from robot_io.policy.artefact import load

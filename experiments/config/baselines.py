@@ -9,12 +9,12 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from ballmodel.io.validation import Count, Name, Positive, Section, Seed
 from experiments.config import experiment as config
 from experiments.config import files
-from experiments.config.experiment import Config
+from experiments.config.experiment import Config, Different
 from experiments.config.optimiser import Optimiser
 from experiments.errors import ConfigError
 
@@ -157,17 +157,10 @@ class Comparison(Section):
     """By the name that the report gives them."""
     budget: Budget
     """Limits of each algorithm with each seed."""
-    seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
+    seeds: Different[Seed] = [0]
     """Repetitions of every training."""
     curve: Curve = Curve()
     """The evaluations during training."""
-
-    @field_validator("seeds")
-    @classmethod
-    def _different(cls, seeds: list[int]) -> list[int]:
-        if len(set(seeds)) < len(seeds):
-            raise ValueError("different seeds")
-        return seeds
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comparison, Config]:
@@ -194,11 +187,8 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    for key in ("experiment", "reality", "robot"):
-        if key == "robot" and not (folder / str(data.get(key))).exists():  # the name of one that comes with the program
-            continue
-        if isinstance(data.get(key), str):
-            data[key] = str((folder / data[key]).resolve())
+    there = (folder / str(data.get("robot"))).exists()  # otherwise it is the name of one that comes with the program
+    files.make_absolute(data, ("experiment", "reality", "robot") if there else ("experiment", "reality"), folder)
     algorithms = data.get("algorithms")
     for settings in algorithms.values() if isinstance(algorithms, dict) else ():
         if isinstance(settings, dict):

@@ -16,7 +16,7 @@ from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
 from bgs.strategy import BGSConfig
 from experiments.config import prior
-from experiments.config.experiment import Config, Rewards, Task, Training
+from experiments.config.experiment import Config, Rewards, Task
 from experiments.config.optimiser import Optimiser
 from experiments.errors import ConfigError, error_context
 from mjx_tt.env import user_defined
@@ -33,6 +33,7 @@ from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io.contract import JOINT_NAMES
 
 # What a seed is used for; each purpose has its own key.
+NONE = Definitions()  # of the user's own
 TRAINING_BALLS, INITIAL_STATE, PROGRESS_BALLS, PROGRESS_EPISODES, EVALUATION_BALLS, EVALUATION_EPISODES = range(6)
 
 
@@ -61,7 +62,10 @@ def experiment(config: Config, where: str) -> Experiment:
     robot, robot_data = robot_of(config, where)
     with error_context(f"{where}: robot"):
         nominal = nominal_model(robot)
-    model_data = with_prior(_mapping(config.model, f"{where}: model"), robot, where)
+    with error_context(f"{where}: model"):
+        own_model = config.model if isinstance(config.model, dict) else yaml.read(config.model)
+        folder = "" if isinstance(config.model, dict) else Path(config.model).parent
+        model_data = with_prior(randomisation.with_content(own_model, folder) or {}, robot, where)
     with error_context():
         origin = f"{where}: model" + (f": {config.model}" if isinstance(config.model, str) else "")
         model = models.from_dict(model_data, origin, nominal)
@@ -71,19 +75,14 @@ def experiment(config: Config, where: str) -> Experiment:
         )
     named = isinstance(config.balls, str) and config.balls in registry.names()
     own, text = definitions(config, where)
-    alone = config.model_copy(
-        update={
-            "balls": config.balls if named else balls.to_dict(),
-            "model": model_data,
-            "robot": robot_data,
-            "definitions": text,
-        }
-    )
+    content = {"balls": config.balls if named else balls.to_dict(), "model": model_data, "robot": robot_data}
+    alone = config.model_copy(update={**content, "definitions": text})
     if config.training.later_rewards is not None:
         with error_context(f"{where}: training.later_rewards"):
             reward_terms(config.training.later_rewards.rewards, own)
     with error_context(f"{where}: task"):
-        task = task_config(config.task, own, robot)
+        terms = {"rewards": reward_terms(config.task.rewards, own), "observations": observation_terms(config.task, own)}
+        task = TaskConfig(**_shared(config.task, TaskConfig) | terms | {"robot": robot})
     with error_context(f"{where}: optimiser"):
         bgs = bgs_config(config.optimiser, config.training.updates)
     return Experiment(alone, balls, model, task, bgs, network(config, where))
@@ -144,7 +143,7 @@ def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
     """The definitions of the experiment's Python file, and its text. Runs the file. Raises ConfigError."""
     given = config.definitions
     if given is None:
-        return Definitions(), None
+        return NONE, None
     contract = robot_of(config, where)[0].contract
     with error_context(f"{where}: definitions"):
         if "\n" in given:
@@ -184,17 +183,7 @@ def distribution(balls: str | dict[str, Any], where: str) -> Balls:
         return registry.resolve(balls)
 
 
-def task_config(
-    task: Task,
-    own: Definitions = Definitions(),  # noqa: B008, it is never changed
-    robot: Robot | None = None,
-) -> TaskConfig:
-    """Settings of the task for a robot; None: the paper's. Raises ValueError where the numbers do not fit together."""
-    settings = _shared(task, TaskConfig) | {"rewards": reward_terms(task.rewards, own)}
-    return TaskConfig(**settings | {"observations": observation_terms(task, own), "robot": robot or robots.paper()})
-
-
-def reward_terms(chosen: str | Rewards, own: Definitions = Definitions()) -> tuple[RewardTerm, ...]:  # noqa: B008
+def reward_terms(chosen: str | Rewards, own: Definitions = NONE) -> tuple[RewardTerm, ...]:
     """The built-in terms and the user's, with their weights. Raises ValueError for an unknown one."""
     base, changed = (chosen, {}) if isinstance(chosen, str) else (chosen.base, chosen.changed)
     return weigh_rewards(PRESETS[base] | changed, own.rewards.values())
@@ -210,15 +199,13 @@ def observation_terms(task: Task, own: Definitions) -> tuple[ObservationTerm, ..
     return (*CONTRACT_OBSERVATIONS, *user)
 
 
-def later_weights(
-    training: Training,
-    own: Definitions = Definitions(),  # noqa: B008
-) -> tuple[int, tuple[float, ...]] | None:
+def later_weights(config: Config) -> tuple[int, tuple[float, ...]] | None:
     """The number of updates after which the reward weights change, and those weights."""
-    later = training.later_rewards
+    later = config.training.later_rewards
     if later is None:
         return None
-    return round(later.after * training.updates), tuple(term.weight for term in reward_terms(later.rewards, own))
+    terms = reward_terms(later.rewards, definitions(config, config.name)[0])
+    return round(later.after * config.training.updates), tuple(term.weight for term in terms)
 
 
 def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
@@ -237,18 +224,13 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
 
 
 def device_count(config: Config) -> int:
-    """Devices to train on: the number asked for, or the most of those present that divide the perturbations evenly."""
-    asked, members = config.training.devices, 2 * config.optimiser.num_directions
-    if jax.process_count() > 1:
-        return _all_devices(asked, members)
-    if asked != "auto":
-        return asked
-    return max(n for n in range(1, jax.local_device_count() + 1) if members % n == 0)
+    """Devices to train on: the number asked for, or the most of those present that divide the perturbations evenly.
 
-
-def _all_devices(asked: int | str, members: int) -> int:
-    """Those of all processes, which have to share the perturbations evenly. Raises ConfigError."""
-    there = jax.device_count()
+    Several processes take all that they have. Raises ConfigError where these do not divide the perturbations.
+    """
+    asked, members, there = config.training.devices, 2 * config.optimiser.num_directions, jax.device_count()
+    if jax.process_count() == 1:
+        return asked if asked != "auto" else max(n for n in range(1, there + 1) if members % n == 0)
     if asked not in ("auto", there):
         raise ConfigError(f"training.devices: {asked}; {jax.process_count()} processes have {there}; allowed: auto")
     if members % there:
@@ -273,11 +255,3 @@ def pool(experiment: Experiment, key: jax.Array, n: int) -> BallPool:
 def _shared(section: Section, settings: type) -> dict[str, Any]:
     """The values of the keys that the settings have too."""
     return {field.name: getattr(section, field.name) for field in fields(settings) if hasattr(section, field.name)}
-
-
-def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:
-    """The content of a model YAML, plain data as it stands there."""
-    with error_context(where):
-        if isinstance(model, dict):
-            return randomisation.with_content(model, "")
-        return randomisation.with_content(yaml.read(model), Path(model).parent) or {}

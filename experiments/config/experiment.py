@@ -8,15 +8,26 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ballmodel.io import validation
 from ballmodel.io.validation import Count, Finite, Fraction, Name, Positive, Section, Seed
 from experiments.config import files
 from experiments.config.optimiser import Optimiser
 from mjx_tt.env.reward_weights import REAL_WEIGHTS, SIM_WEIGHTS
+
+
+def _check_different(values: list) -> list:
+    if len(set(values)) < len(values):
+        raise ValueError("different entries")
+    return values
+
+
+T = TypeVar("T")
+Different = Annotated[list[T], Field(min_length=1), AfterValidator(_check_different)]
+ALLOWED_TERMS = f"{', '.join(SIM_WEIGHTS)}, and terms of a file that the key definitions names"
 
 
 def _describe_weights(schema: dict[str, Any]) -> None:
@@ -163,41 +174,39 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Config:
-        refuse_rewards(self.optimiser, self.task, "", {"training.later_rewards": self.training.later_rewards})
-        if self.definitions is None:
-            refuse_unknown_terms("task.rewards", self.task.rewards)
-            if self.training.later_rewards is not None:
-                refuse_unknown_terms("training.later_rewards.rewards", self.training.later_rewards.rewards)
+        later = {"training.later_rewards": self.training.later_rewards}
+        refuse_rewards(self.optimiser, self.task, "", later, self.definitions is not None)
         return self
 
 
-def refuse_unknown_terms(key: str, rewards: str | Rewards) -> None:
-    """Raises ValueError for weights of other terms than the built-in ones. key: of the weights, for the message."""
+def refuse_unknown_terms(key: str, rewards: str | Rewards, allowed: str = ALLOWED_TERMS) -> None:
+    """Raises ValueError for weights of terms that are not built in, in a message with ``key`` and ``allowed``."""
     for name in () if isinstance(rewards, str) else rewards.changed:
         if name not in SIM_WEIGHTS:
             hint = validation.nearest(name, SIM_WEIGHTS)
-            raise ValueError(
-                f"{key}.{name}: unknown reward term; {hint}{hint and ' '}allowed: "
-                f"{', '.join(SIM_WEIGHTS)}, and terms of a file that the key definitions names"
-            )
+            raise ValueError(f"{key}.{name}: unknown reward term; {hint}{hint and ' '}allowed: {allowed}")
 
 
-def refuse_rewards(optimiser: Optimiser, task: Task, where: str, later: dict[str, LaterRewards | None]) -> None:
-    """Raises ValueError for rewards that first-order gradients do not know: user-defined ones, and ``later`` ones by
-    their key.
+def refuse_rewards(
+    optimiser: Optimiser, task: Task, where: str, later: dict[str, LaterRewards | None], own: bool = False
+) -> None:
+    """Raises ValueError for rewards that first-order gradients do not know, user-defined ones and ``later`` ones by
+    their key, and for unknown terms, unless a file of one's ``own`` defines some.
 
     where: before the other keys in the message.
     """
-    if optimiser.gradient != "first_order":
-        return
     changed = {} if isinstance(task.rewards, str) else task.rewards.changed
     user = {f"{where}task.rewards.{name}": weight for name, weight in changed.items() if name not in SIM_WEIGHTS}
     for key, given in (later | user).items():
-        if given:
+        if given and optimiser.gradient == "first_order":
             raise ValueError(
                 f"{key}: {where}optimiser.gradient first_order climbs an objective of its own, in which it has no "
                 "part; leave it out, or take gradient: zeroth_order"
             )
+    if not own:
+        refuse_unknown_terms(f"{where}task.rewards", task.rewards)
+        for key, rest in later.items():
+            refuse_unknown_terms(f"{key}.rewards", "sim" if rest is None else rest.rewards)
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from ballmodel.io import validation
 from ballmodel.io.validation import Count, Seed
 from experiments.config import files
-from experiments.config.experiment import Config, Rewards
+from experiments.config.experiment import Config, Rewards, refuse_unknown_terms
 from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
-from experiments.errors import ConfigError
-from mjx_tt.env.reward_weights import MEASURED_WEIGHTS, SIM_WEIGHTS
+from mjx_tt.env.reward_weights import MEASURED_WEIGHTS
 
 # Policies by first-order gradients return a third of their balls where the paper's sigma moves them, and learn from
 # that where to go (docs/results/fine-tuning.md).
@@ -42,6 +40,18 @@ class FineTuning(Shaping):
     seed: Seed = 0
     """Of the perturbations."""
 
+    @model_validator(mode="after")
+    def _measured(self) -> FineTuning:
+        measured = ", ".join(MEASURED_WEIGHTS)
+        given = Rewards.model_validate({"base": self.rewards}) if isinstance(self.rewards, str) else self.rewards
+        if given.base == "sim":
+            raise ValueError(f"rewards: expected weights based on real, got sim; a robot measures only {measured}")
+        refuse_unknown_terms("rewards", given, measured)
+        for name, weight in given.changed.items():
+            if weight and name not in MEASURED_WEIGHTS:
+                raise ValueError(f"rewards.{name}: expected 0, got {weight}; a robot measures only {measured}")
+        return self
+
     @property
     def episodes_per_update(self) -> int:
         return 2 * self.num_directions * self.repeats
@@ -69,30 +79,4 @@ def load(path: str | Path | None = None, overrides: tuple[str, ...] = (), traine
         data, where = data | files.read_mapping(path), str(path)
     for override in overrides:
         files.apply_override(data, override)
-    return parse(data, where)
-
-
-def parse(data: dict[str, Any], where: str) -> FineTuning:
-    """FineTuning from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    settings = files.validate(FineTuning, data, where)
-    if settings.rewards == "sim" or not isinstance(settings.rewards, str):
-        _check_rewards(settings.rewards, where)
-    return settings
-
-
-def _check_rewards(rewards: str | Rewards, where: str) -> None:
-    if isinstance(rewards, str) or rewards.base == "sim":
-        raise ConfigError(
-            f"{where}: rewards: expected weights based on real, got sim; a robot measures only "
-            f"{', '.join(MEASURED_WEIGHTS)}"
-        )
-    for name, weight in rewards.changed.items():
-        if name not in SIM_WEIGHTS:
-            hint = validation.nearest(name, SIM_WEIGHTS)
-            allowed = f"{hint}{hint and ' '}allowed: {', '.join(MEASURED_WEIGHTS)}"
-            raise ConfigError(f"{where}: rewards.{name}: unknown reward term; {allowed}")
-        if weight and name not in MEASURED_WEIGHTS:
-            raise ConfigError(
-                f"{where}: rewards.{name}: expected 0, got {weight}; a robot measures only "
-                f"{', '.join(MEASURED_WEIGHTS)}"
-            )
+    return files.validate(FineTuning, data, where)

@@ -13,8 +13,7 @@ from ballmodel.io.validation import Count, Decay, Positive, Section
 NumDirections = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
 EliteFraction = Annotated[float, Field(gt=0, le=1, description="Share of the pairs that become elites.")]
 EmaDecay = Annotated[
-    Decay,
-    Field(description="Decay per update of the moving average of the parameters, which is exported; 0: none."),
+    Decay, Field(description="Decay per update of the moving average of the parameters, which is exported; 0: none.")
 ]
 
 
@@ -91,9 +90,7 @@ class Shaping(Section):
     """Keys of Blackbox Gradient Sensing that training and fine-tuning share with their defaults."""
 
     model_config = ConfigDict(
-        json_schema_extra={
-            "renamed": {"pairs": "num_directions", "keep": "elite_fraction", "average": "ema_decay"},
-        }
+        json_schema_extra={"renamed": {"pairs": "num_directions", "keep": "elite_fraction", "average": "ema_decay"}}
     )
 
     sigma: Positive = 0.025

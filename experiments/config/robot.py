@@ -95,22 +95,18 @@ def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
 
     Another robot's arm and axes react as late as its YAML says, unless rig.yaml says how late.
     """
-    standard = RigParams()
-    if robot is not None and robot.contract != PAPER:
-        known, arm = dict(robot.file.model), standard.arm
-        late, reported, moved = (
-            known.get(f"latency.{key}") for key in ("abb_action", "abb_observation", "festo_action")
-        )
-        arm = replace(
-            arm,
-            feedback_delay=arm.feedback_delay if reported is None else reported,
-            dead_time=arm.dead_time if late is None else max(late - rig_config.ARM_RESPONSE, 0.0),
-        )
-        dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
-        standard = replace(standard, arm=arm, axis_dead_time=dead)
+    standard, contract = RigParams(), PAPER if robot is None else robot.contract
+    if robot is not None and contract != PAPER:
+        known, arm = dict(robot.file.model), dict[str, Any]()
+        if (reported := known.get("latency.abb_observation")) is not None:
+            arm["feedback_delay"] = reported
+        if (late := known.get("latency.abb_action")) is not None:
+            arm["dead_time"] = max(late - rig_config.ARM_RESPONSE, 0.0)
+        standard = replace(standard, arm=replace(standard.arm, **arm))
+        if (moved := known.get("latency.festo_action")) is not None:
+            standard = replace(standard, axis_dead_time=max(moved - rig_config.AXIS_RESPONSE, 0.0))
         with error_context():
-            RobotConfig.of(robot.contract).check_joints(robot.contract)
-    contract = PAPER if robot is None else robot.contract
+            RobotConfig.of(contract).check_joints(contract)
     params = standard if path is None else fill(RigParams, read_mapping(path), str(path), standard, contract)
     return for_robot(params, contract)
 

@@ -6,17 +6,14 @@ providers of the same name (Babuji et al. 2019, "Parsl: Pervasive Parallel Progr
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from ballmodel.io.validation import Count, Positive, Section
 from experiments.config import files
-from experiments.errors import ConfigError
 
 
 def _walltime(value: Any) -> Any:
@@ -126,16 +123,6 @@ class Site(Section):
 
 
 def load(path: str | os.PathLike) -> Site:
-    """Reads a site. Raises ConfigError with one line per mistake, or naming the extra to install."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"--site {path}: cannot be read: {reason}; allowed: {OWN}, or a site's YAML") from None
-    data = files.read_yaml(text, str(path))
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: a site is a mapping with the keys {', '.join(Site.model_fields)}")
-    site = files.validate(Site, data, str(path))
-    if importlib.util.find_spec("parsl") is None:
-        raise ConfigError(f"{path}: provider.kind {site.provider.kind} needs parsl: pip install 'mjx-tt[cluster]'")
-    return site
+    """Reads a site. Raises ConfigError with one line per mistake."""
+    data = files.read_mapping(path, lambda: f"--site takes {OWN}, or a site's YAML")
+    return files.validate(Site, data, str(path))

@@ -35,7 +35,7 @@ class Mark:
 def changes(experiment: Experiment) -> list[Mark]:
     """Changes on the way of a training: of reward weights, and of the scale of the perturbations."""
     config, found = experiment.config, []
-    later = build.later_weights(config.training, build.definitions(config, config.name)[0])
+    later = build.later_weights(config)
     if later is not None:
         update, weights = later
         terms = zip(experiment.task.terms, experiment.task.reward_weights, weights, strict=True)

@@ -8,19 +8,18 @@ so nothing depends on who does it.
 from __future__ import annotations
 
 import importlib
-import os
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.interrupts import sigterm_interrupts
 from experiments.jobs import worker
 from experiments.jobs.heartbeat import Heartbeat
-from experiments.jobs.worker import Stopped, sigterm_interrupts
-from mjx_tt import platform
+from experiments.jobs.worker import Stopped
+from experiments.options import start_jax
 
 POLL = 0.5  # [s] between looks at whether a stop was asked for, and at which programs are compiled
 SAVING = 600.0  # [s] for jobs to save when they are asked to stop: a compilation comes first
@@ -34,7 +33,7 @@ class Setup:
     prepare    "module:function", called once in each worker with ``given``; returns the function that does a job. Its
                module is loaded when the worker has its cores, which libraries count when they load
     devices    host devices of a worker, the least that its jobs need
-    cache      folder of compiled programs; None: JAX keeps none
+    cache      folder of compiled programs; None: the user's
     """
 
     prepare: str
@@ -44,10 +43,7 @@ class Setup:
 
     def prepared(self) -> Callable[..., Any]:
         """Function that does a job, in a worker."""
-        # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once.
-        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in a command
-        platform.configure(self.devices, self.cache)
+        start_jax(self.devices, cache=self.cache)
         module, _, function = self.prepare.partition(":")
         return getattr(importlib.import_module(module), function)(*self.given)
 
@@ -70,7 +66,7 @@ class Job:
 
 
 class Engine:
-    """Does jobs in workers, which see this process's heartbeat. ``engines`` has the two kinds.
+    """Does jobs in workers, which see this process's heartbeat. ``site`` has the two kinds.
 
     slots: jobs that it takes at a time
     replaces: another worker goes on with the job of one that was ended
@@ -85,7 +81,7 @@ class Engine:
 
     def __init__(self, setup: Setup, folder: Path) -> None:
         self._heartbeat, self._failed = Heartbeat(folder.absolute() / FOLDER), False
-        self._session = worker.Session(setup.prepared, str(self._heartbeat.folder), str(Path.cwd()), self.replaces)
+        self._session = (setup.prepared, str(self._heartbeat.folder), str(Path.cwd()), self.replaces)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Result of the function in a worker."""
@@ -100,24 +96,23 @@ class Engine:
         raise NotImplementedError
 
     def submit(self, job: Job) -> Future[Any]:
-        """Result of the job, or ``Stopped``. Raises nothing; the future raises what the job does, or RunError."""
-        result: Future[Any] = Future()
-
-        def settle(done: Future[Any]) -> None:
-            error = None if done.cancelled() else done.exception()
-            if error is not None:
-                self._failed = True
-                result.set_exception(self._explain(job, error))
-            else:
-                result.set_result(Stopped("") if done.cancelled() else done.result())
-
+        """Begins a job, whose end ``result`` takes. Raises nothing."""
         try:
-            done = self._call(worker.work, self._session, job.name, job.arguments)
+            return self._call(worker.work, *self._session, job.name, job.arguments)
         except RuntimeError as error:  # of a pool whose process was killed in another job
-            done = Future()
+            done: Future[Any] = Future()
             done.set_exception(error)
-        done.add_done_callback(settle)
-        return result
+            return done
+
+    def result(self, job: Job, done: Future[Any]) -> Any:
+        """Result of a job that has ended, or ``Stopped``. Raises what the job does, or RunError."""
+        if done.cancelled():
+            return Stopped("")
+        error = done.exception()
+        if error is None:
+            return done.result()
+        self._failed = True
+        raise self._explain(job, error)
 
     def check(self) -> None:
         """Raises KeyboardInterrupt where the file ``stop`` asks for it."""
@@ -164,13 +159,16 @@ def run(
                     waiting.remove(job)
                 for future in wait(running, POLL, FIRST_COMPLETED).done:
                     job = running[future]
-                    error = future.exception()
-                    if error is None and isinstance(future.result(), Stopped):
-                        raise KeyboardInterrupt(future.result().text)
-                    if isinstance(error, Exception) and failed is not None:
+                    try:
+                        result = engine.result(job, future)
+                    except Exception as error:
+                        if failed is None:
+                            raise
                         failed(job, error)
                     else:
-                        ended(job, future.result())
+                        if isinstance(result, Stopped):
+                            raise KeyboardInterrupt(result.text)
+                        ended(job, result)
                     if job.program:
                         warm.add(job.program)
                     del running[future]

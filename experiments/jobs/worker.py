@@ -7,16 +7,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import connection, parent_process
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from experiments.errors import LockedError
+from experiments.interrupts import sigterm_interrupts
 from experiments.jobs.heartbeat import Watchdog
 
 PATIENCE = 120.0  # [s] for the lock of a folder whose worker was lost: network file systems free it late
@@ -33,36 +32,40 @@ class Stopped:
     text: str
 
 
-@dataclass(frozen=True)
-class Session:
-    """Everything that a worker has to know besides its job.
+_ready: dict[str, tuple[Callable[..., Any], Watchdog]] = {}  # by the heartbeat's folder
 
-    prepare    returns the function that does a job; called once in each worker
-    heartbeat  folder of the heartbeat
-    folder     working directory of the process that gives jobs; paths are the same on all hosts
-    replaced   another worker goes on with the job of one that gets a SIGTERM from outside
+
+def work(
+    prepare: Callable[[], Callable[..., Any]],
+    heartbeat: str,
+    folder: str,
+    replaced: bool,
+    name: str,
+    arguments: tuple[Any, ...],
+) -> Any:
+    """Does a job: its result, or ``Stopped``.
+
+    Args:
+        prepare: returns the function that does a job; called once in each worker.
+        heartbeat: folder of the heartbeat.
+        folder: working directory of the process that gives jobs; paths are the same on all hosts.
+        replaced: another worker goes on with the job of one that gets a SIGTERM from outside.
+        name: of the job.
+        arguments: of the function.
+
+    Raises:
+        Exception: what the job does.
+        WorkerEndedError: a SIGTERM from outside.
     """
-
-    prepare: Callable[[], Callable[..., Any]]
-    heartbeat: str
-    folder: str
-    replaced: bool
-
-
-_ready: dict[str, tuple[Callable[..., Any], Watchdog]] = {}  # by the session's heartbeat
-
-
-def work(session: Session, name: str, arguments: tuple[Any, ...]) -> Any:
-    """Does a job: its result, or ``Stopped``. Raises what the job does, WorkerEndedError for a SIGTERM from outside."""
-    if session.heartbeat not in _ready:
-        watchdog = Watchdog(Path(session.heartbeat))
+    if heartbeat not in _ready:
+        watchdog = Watchdog(Path(heartbeat))
         if watchdog.stopping:
             return Stopped("")
-        os.chdir(session.folder)
-        if session.folder not in sys.path:
-            sys.path.insert(0, session.folder)  # as where the command was given: the project's tests are there
-        _ready[session.heartbeat] = session.prepare(), watchdog
-    do, watchdog = _ready[session.heartbeat]
+        os.chdir(folder)
+        if folder not in sys.path:
+            sys.path.insert(0, folder)  # as where the command was given: the project's tests are there
+        _ready[heartbeat] = prepare(), watchdog
+    do, watchdog = _ready[heartbeat]
     until = time.monotonic() + PATIENCE
     try:
         with watchdog.doing(name), sigterm_interrupts():
@@ -75,7 +78,7 @@ def work(session: Session, name: str, arguments: tuple[Any, ...]) -> Any:
                     time.sleep(1.0)
             return Stopped("")
     except KeyboardInterrupt as stopped:
-        if watchdog.stopping or not session.replaced:
+        if watchdog.stopping or not replaced:
             return Stopped(str(stopped))
         raise WorkerEndedError(f"{name}: {stopped or 'ended by SIGTERM'}") from None
 
@@ -95,20 +98,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         connection.wait([parent.sentinel])
         os._exit(1)
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """Inside, SIGTERM is a Ctrl-C, also for a worker's job."""
-    if threading.current_thread() is not threading.main_thread():  # where nobody may set handlers
-        yield
-        return
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

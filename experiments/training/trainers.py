@@ -26,6 +26,6 @@ def trainer(experiment: Experiment) -> Trainer:
         config.optimiser.repeats,
         config.optimiser.common_random_numbers,
         config.optimiser.initial_scale,
-        build.later_weights(config.training, build.definitions(config, config.name)[0]),
+        build.later_weights(config),
         experiment.network,
     )

@@ -76,7 +76,7 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
         --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
         study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip;
         log lerobot nowhere --out a; fit-human file --fit nelder-mead --model file --out a.yaml""",
-        2: """trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu;
+        2: """trian; train; evaluate . --episodes 0; evaluate . --episodes 2.5; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu;
         fit-human file --fit simplex --out a.yaml""",
         0: "--version; --help",
     }
@@ -92,6 +92,14 @@ for arguments, code in {lines!r}:
     done = subprocess.run([sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert metadata.version("mjx-tt") in done.stdout
+
+
+def test_a_missing_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "dpkt", None)
+    (tmp_path / "arm.pcap").write_text("")
+    done = mjx_tt("log", "replay", tmp_path / "arm.pcap")
+    assert done.returncode == 1
+    assert done.stderr == "mjx-tt: error: dpkt is missing: pip install 'mjx-tt[capture]'\n"
 
 
 @pytest.mark.smoke

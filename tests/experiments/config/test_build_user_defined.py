@@ -58,8 +58,7 @@ def test_its_terms_are_measured_and_weigh(trained):
     assert list(report["terms"])[-2:] == ["calm_wrist", "deep"]
     experiment = build.experiment(config.load(trained / "my_task.yaml"), "my_task.yaml")
     assert experiment.task.reward_weights[-2:] == (0.2, 0.5)
-    own = build.definitions(experiment.config, "my_task.yaml")[0]
-    assert build.later_weights(experiment.config.training, own)[1][-2:] == (0.0, 2.0)
+    assert build.later_weights(experiment.config)[1][-2:] == (0.0, 2.0)
 
 
 @pytest.mark.slow
@@ -125,10 +124,7 @@ def test_it_is_fine_tuned_on_the_emulated_robot(trained):
     [
         ({"network": "cnn"}, "network: expected one of gru, got cnn"),
         ({"task.rewards": "{calm: 1}"}, "task: rewards: calm is no reward term; allowed: .*calm_wrist, deep"),
-        (
-            {"definitions": "null"},
-            "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions",
-        ),
+        ({"definitions": "null"}, "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions"),
     ],
 )
 def test_mistakes_in_the_yaml_are_named(folder, changes, says):

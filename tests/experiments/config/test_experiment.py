@@ -48,12 +48,7 @@ def test_shipped_experiments_load_and_fit_the_schema(path):
     [
         ("trainin", {}, "trainin: expected one of the keys name, balls,", "did you mean 'training'?"),
         ("optimiser.pairs", 5, "optimiser.pairs: expected", "it is now called num_directions"),
-        (
-            "optimiser.rank",
-            "singed",
-            "rank: expected 'abs', 'signed' or 'max', got",
-            "did you mean 'signed'?",
-        ),
+        ("optimiser.rank", "singed", "rank: expected 'abs', 'signed' or 'max', got", "did you mean 'signed'?"),
         (
             "optimiser.step.schedule",
             {"kind": "piecewise", "changes": [{"update": 5, "rate": 0.1}]},

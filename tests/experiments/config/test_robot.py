@@ -14,32 +14,8 @@ from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.devices.festo import CmmtProfile
 from robot_io.emulator.config import RigParams
 
-VALUES = [
-    0,
-    1,
-    -1,
-    7,
-    0.5,
-    -0.25,
-    1e-9,
-    1e6,
-    1e308,
-    -1e308,
-    10**400,
-    float("inf"),
-    float("nan"),
-    65536,
-    True,
-    None,
-    "x",
-    "1",
-    [],
-    [1.0],
-    [1e300] * 8,
-    [-1.0, 1.0],
-    {},
-    {"x": 1},
-]
+VALUES = [0, 1, -1, 7, 0.5, -0.25, 1e-9, 1e6, 1e308, -1e308, 10**400, float("inf"), float("nan"), 65536]
+VALUES += [True, None, "x", "1", [], [1.0], [1e300] * 8, [-1.0, 1.0], {}, {"x": 1}]
 # What protects people and robot ends here, whatever a file says (docs/concepts/safety.md).
 CEILINGS = {
     "arm.timeout": (0.01, 0.1),

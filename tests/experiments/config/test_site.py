@@ -9,7 +9,7 @@ import yaml
 
 from experiments.config import site
 from experiments.errors import ConfigError
-from experiments.jobs import engines
+from experiments.jobs.site import accelerators
 
 CORES = len(os.sched_getaffinity(0))
 SLURM = {"provider": {"kind": "slurm", "walltime": "01:30:00"}, "workers_per_node": 16}
@@ -25,21 +25,15 @@ def write(folder, data):
 @pytest.mark.parametrize(
     "data, message",
     [
-        (
-            SLURM | {"worker_per_node": 2},
-            r"worker_per_node: expected .*; did you mean 'workers_per_node'\?",
-        ),
-        (
-            SLURM | {"provider": {"kind": "slurn"}},
-            r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'",
-        ),
+        (SLURM | {"worker_per_node": 2}, r"worker_per_node: expected .*; did you mean 'workers_per_node'\?"),
+        (SLURM | {"provider": {"kind": "slurn"}}, r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'"),
         (
             SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
             r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got '90'",
         ),
         (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
         (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
-        ("- slurm", r"a site is a mapping with the keys provider, workers_per_node"),
+        ("- slurm", r"cluster.yaml: expected a mapping, got \['slurm'\]"),
     ],
 )
 def test_a_mistake_is_named(tmp_path, data, message):
@@ -51,5 +45,5 @@ def test_a_mistake_is_named(tmp_path, data, message):
 
 def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
     two = site.load(write(tmp_path, SLURM | {"workers_per_node": 2, "accelerators_per_worker": 2}))
-    assert engines.accelerators(two) == ["0,1", "2,3"]
-    assert engines.accelerators(site.load(write(tmp_path, SLURM))) == []
+    assert accelerators(two) == ["0,1", "2,3"]
+    assert accelerators(site.load(write(tmp_path, SLURM))) == []

@@ -132,7 +132,7 @@ def test_a_worker_ends_when_nobody_waits_for_it_and_saves_when_the_heartbeat_sta
 import sys, time
 from pathlib import Path
 from experiments.jobs import heartbeat
-from experiments.jobs.worker import sigterm_interrupts
+from experiments.interrupts import sigterm_interrupts
 heartbeat.PERIOD, heartbeat.TIMEOUT = 0.5, 2.0
 watch = heartbeat.Watchdog(Path(sys.argv[1]))
 try:

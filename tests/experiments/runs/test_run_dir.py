@@ -1,4 +1,4 @@
-"""A run's folder belongs to one configuration, from its first measurement on."""
+"""A run's folder belongs to one configuration from its first measurement on; measurements go on after a checkpoint."""
 
 from __future__ import annotations
 
@@ -44,3 +44,21 @@ def test_a_run_that_has_just_begun_keeps_its_configuration(tmp_path):
     with run.locked(), pytest.raises(RunError, match="another process is training here"):
         Run(run.folder).open(other)
     assert run.config() == mine
+
+
+def test_metrics_continue_after_the_checkpoint(tmp_path):
+    path, board = tmp_path / "metrics.jsonl", tmp_path / "board"
+    log = MetricsLog(path, board, 0)
+    log.write([{"update": i, "loss": float(i)} for i in (1, 2, 3)])
+    log.close()
+    with open(path, "a") as file:
+        file.write('{"update": 4, "lo')  # killed in the middle of a line
+    log = MetricsLog(path, board, 2)
+    log.write([{"update": 3, "loss": 30.0}])
+    log.close()
+    assert [json.loads(line) for line in path.read_text().splitlines()] == [
+        {"update": 1, "loss": 1.0},
+        {"update": 2, "loss": 2.0},
+        {"update": 3, "loss": 30.0},
+    ]
+    assert len(list(board.glob("events.*"))) == 2

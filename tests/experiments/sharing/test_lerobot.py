@@ -204,7 +204,7 @@ def test_lerobots_own_reader_gives_the_values_back(written, balls, tmp_path):
     assert again["observation.state"].shape == (38, 3) and set(again["task"].tolist()) == {recordings.FLIGHT}
 
 
-def test_command(session, balls, tmp_path, capsys, monkeypatch):
+def test_command(session, balls, tmp_path, capsys):
     out = tmp_path / "set"
     assert cli.main(["log", "lerobot", str(session), "--out", str(out)]) == 0
     assert f"{out}: 2 episodes, 42 frames at 75 Hz\nleft out: 1 episodes" in capsys.readouterr().out
@@ -216,6 +216,3 @@ def test_command(session, balls, tmp_path, capsys, monkeypatch):
     ):
         assert cli.main(["log", "lerobot", *arguments]) == 1
         assert words in capsys.readouterr().err
-    monkeypatch.setattr("experiments.commands.log.find_spec", lambda name: None)
-    assert cli.main(["log", "lerobot", str(session), "--out", "x"]) == 1
-    assert "pip install 'mjx-tt[lerobot]'" in capsys.readouterr().err

@@ -226,7 +226,7 @@ def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     assert (
         later.optimiser.step.learning_rate < first.optimiser.step.learning_rate == oracle.optimiser.step.learning_rate
     )
-    assert build.later_weights(later.training)[0] == 0
+    assert build.later_weights(later)[0] == 0
 
 
 def test_the_papers_study_trains_as_the_papers_training():

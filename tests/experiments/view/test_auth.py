@@ -12,7 +12,6 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from experiments import cli
-from experiments.commands import view
 from experiments.errors import ConfigError
 from experiments.runs.locate import SHIPPED
 from experiments.view import auth
@@ -142,7 +141,7 @@ def test_a_viser_that_starts_its_server_in_another_way_is_refused_and_its_tunnel
         auth.Server("127.0.0.1", 0)
 
 
-def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys, monkeypatch):
+def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys):
     policy = str(SHIPPED / "quickstart")
     for arguments, words in (
         (["nowhere"], "neither a run"),
@@ -155,6 +154,3 @@ def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys,
     ):
         assert cli.main(["view", *arguments]) in (1, 2)
         assert words in capsys.readouterr().err
-    monkeypatch.setattr(view, "find_spec", lambda name: None if name == "viser" else object())
-    assert cli.main(["view"]) == 1
-    assert capsys.readouterr().err == "mjx-tt: error: view needs viser: pip install 'mjx-tt[view]'\n"

@@ -152,7 +152,7 @@ def test_a_wrong_zero_of_an_encoder_is_named_where_the_pose_at_rest_is_given(tmp
     )
     (tmp_path / "command.csv").write_text("\n".join(command))
     (tmp_path / "state.csv").write_text("\n".join(state))
-    request, logs = diagnose.Request(out=str(tmp_path / "out"), home="home"), [str(tmp_path)]
+    request, logs = diagnose.Request(out=tmp_path / "out", home="home"), [str(tmp_path)]
     (cause,) = diagnose.run(logs, request, Console(quiet=True)).verdict.causes
     estimate = cause.parameters["joint_2.joint_offset"]
     # The interval of 90 % misses in 5 of 40 seeds, and in this one: noise of 0.1 mrad in 500 states.

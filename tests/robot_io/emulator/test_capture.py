@@ -74,7 +74,7 @@ def test_a_captured_session_replayed_on_the_same_controller_goes_where_it_went(s
 
 def test_the_command_says_how_the_controller_differs_from_the_emulated_one(session, tmp_path, capsys):
     path = written(tmp_path / "arm.pcap", [row for i, row in enumerate(session) if i not in (20, 22)], PcapWriter)
-    assert log("replay", str(path), out=str(tmp_path / "arm.csv")) == 0
+    assert log("replay", path, out=tmp_path / "arm.csv") == 0
     text = capsys.readouterr().out
     assert "498 packets of the controller, 2 lost" in text and "every 4.0 ms" in text
     table = np.loadtxt(tmp_path / "arm.csv", delimiter=",", skiprows=1)
