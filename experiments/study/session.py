@@ -26,9 +26,9 @@ from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
-from experiments.study import identification, training
+from experiments.study import identification
 from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
-from experiments.study.pipeline import Pipeline
+from experiments.study.pipeline import Pipeline, make_config
 from experiments.study.schedule import Simulated, list_items
 from experiments.study.target_domain import on_robot
 from experiments.study.workflow import Journal, Step, Waiting, list_unfinished, perform
@@ -73,7 +73,7 @@ def look_up(study: Study) -> None:
         build.distribution(balls, "ablation.balls")
     for item in list_items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
-            build.experiment(training.make_config(study, item, "narrow", None, 0), "simulation")
+            build.experiment(make_config(study, item, "narrow", None, 0), "simulation")
     if study.identification is not None:
         with error_context("identification"):
             identification.read_prior(study.identification.prior, "prior")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,11 @@ class Step:
     run: Callable[[], str]
     program: str | None = None
     compiled: Path | None = None
+
+
+def derive_seed(name: str) -> int:
+    """Seed of a step of that name."""
+    return zlib.crc32(name.encode()) >> 1
 
 
 class Journal:

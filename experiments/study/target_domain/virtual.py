@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -39,6 +38,7 @@ from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.analysis import delays, scoring
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
 from experiments.study.target_domain.hit_log import HitLog
+from experiments.study.workflow import derive_seed
 from experiments.training.update import TrainState
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.env.episode import MISSED, RETURNED
@@ -285,7 +285,7 @@ class VirtualWorld:
         self._study, self._seed, self.reality = study, seed, reality.at(seed)
 
     def _key(self, name: str) -> PRNGKeyArray:
-        return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
+        return jax.random.fold_in(build.key(self._seed, STUDY), derive_seed(name))
 
     def first_balls(self, player: str, name: str) -> Dataset:
         """The player's balls across the table, without a robot."""
