@@ -71,29 +71,25 @@ class Journal:
         self.path = path
         self.entries: list[Entry] = []
         self._digest = hashlib.sha256()  # of all lines
-        whole = self._read() if path.exists() else 0
-        self._file = open(path, "ab", buffering=0)
-        os.ftruncate(self._file.fileno(), whole)
-        os.fsync(self._file.fileno())
-        sync_folder(path.parent)
+        if path.exists():
+            os.truncate(path, self._read())
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
         line = content = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
-        handle = self._file.fileno()
-        start = os.fstat(handle).st_size
-        try:
-            while line:
-                line = line[os.write(handle, line) :]
-            os.fsync(handle)
-        except OSError:
-            os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
-            raise
+        with open(self.path, "ab", buffering=0) as file:
+            start = file.seek(0, os.SEEK_END)
+            try:
+                while line:
+                    line = line[file.write(line) :]
+                os.fsync(file)
+            except OSError:
+                file.truncate(start)  # no half a line in the middle, should there be room again
+                raise
+        if not start:
+            sync_folder(self.path.parent)
         self._digest.update(content)
         self._take(entry)
-
-    def close(self) -> None:
-        self._file.close()
 
     def _take(self, entry: Entry) -> None:
         """A line about the episode before, which was discarded late, stands in its place."""
@@ -134,14 +130,8 @@ class Journal:
 
 
 def _to_json(entry: Entry) -> dict[str, Any]:
-    shown = {name: getattr(entry, name) for name in ("phase", "update", "member", "repeat", "episode")}
-    return shown | {
-        "summary": asdict(entry.summary),
-        "terms": entry.terms,
-        "return": entry.returns,
-        "discarded": entry.discarded,
-        "trajectory": [[float(v) for v in sample] for sample in entry.trajectory],
-    }
+    data = asdict(entry) | {"trajectory": entry.trajectory.tolist()}
+    return {"return" if name == "returns" else name: value for name, value in data.items()}
 
 
 def _from_json(data: dict[str, Any]) -> Entry:
