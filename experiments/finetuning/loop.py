@@ -275,8 +275,8 @@ class FineTuningRun:
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
                     "are done; restore the file or start a new run"
                 )
-            # A ball that is played again is another one: every attempt counts. Before and after an evaluation's are the
-            # same, where the robot can.
+            # A ball that is played again is another one: every attempt counts. The balls of the evaluations before and
+            # after are the same, where the robot can.
             phase, update = slot[:2]
             if phase == TRAINING:
                 number = sum(entry.phase == TRAINING for entry in self.journal.entries)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import hashlib
 import json
 import platform
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -201,6 +202,12 @@ def write_yaml(path: Path, data: dict[str, Any]) -> None:
     """Replaces the file by YAML in the order given, whole or not at all. Raises OSError."""
     with replacing(path) as temporary:
         temporary.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+
+
+def write_csv(path: Path, head: Sequence[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Replaces the file by a table, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows((head, *rows))
 
 
 def _git(root: Path, *arguments: str) -> str | None:

@@ -7,8 +7,6 @@ samples; what no log shows is drawn from a stated prior. Nothing here knows the 
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ballmodel.io import read
-from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
+from experiments.runs import run_dir
 from experiments.study.analysis import delays
 from experiments.study.analysis.identified import PRIOR_ALONE
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
@@ -158,14 +156,14 @@ def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -
 def write_joints(folder: Path, records: Collection[JointRecord]) -> None:
     """Writes command.csv and state.csv into a folder, as ``mjx-tt diagnose`` reads them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, quantity in zip(ROBOT_FILES, ("velocity", "position"), strict=True):
-        text = io.StringIO()
-        writer = csv.writer(text)
-        writer.writerow(("t", "joint", quantity))
-        for record in records:
-            command = quantity == "velocity"
-            time = record.command_time if command else record.state_time
-            values = record.command_velocity if command else record.state_position
-            writer.writerows((repr(float(t)), record.joint, repr(float(v))) for t, v in zip(time, values, strict=True))
-        with replacing(folder / name) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf-8")
+    parts = {
+        "velocity": [(r.joint, r.command_time, r.command_velocity) for r in records],
+        "position": [(r.joint, r.state_time, r.state_position) for r in records],
+    }
+    for file, (quantity, columns) in zip(ROBOT_FILES, parts.items(), strict=True):
+        rows = (
+            (repr(float(t)), joint, repr(float(v)))
+            for joint, time, values in columns
+            for t, v in zip(time, values, strict=True)
+        )
+        run_dir.write_csv(folder / file, ("t", "joint", quantity), rows)

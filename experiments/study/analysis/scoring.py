@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballmodel.io.atomic_files import replacing
 from experiments.errors import ConfigError, error_context
+from experiments.runs import run_dir
 from mjx_tt.rally.end_reasons import ROWS, End
 
 POOL = 60
@@ -134,10 +134,7 @@ def write(path: Path, rallies: Rallies) -> None:
     columns["robot_ended"] = ["" if e == UNKNOWN else e for e in columns["robot_ended"]]
     for name in ("filtered", "selected"):
         columns[name] = [int(flag) for flag in columns[name]]
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(zip(*columns.values(), strict=True))
+    run_dir.write_csv(path, COLUMNS, zip(*columns.values(), strict=True))
 
 
 def read(path: Path) -> Rallies:
