@@ -32,7 +32,6 @@ from experiments.config.finetuning import FineTuning
 from experiments.errors import RunError
 from experiments.finetuning import report
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
-from experiments.finetuning.progress import FineTuningProgress
 from experiments.finetuning.robot import LockStepRobot, Operator, Robot
 from experiments.progress import print_files
 from experiments.runs import checkpoint, load_policy, metrics, run_dir
@@ -164,9 +163,9 @@ class FineTuningRun:
         operator: Operator,
         console: Console,
         first: TrainState,
-        network: Network | None = None,
+        network: Network,
     ) -> None:
-        self._network = None if network is None else jax_policy.exported(network)
+        self._network = jax_policy.exported(network)
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
         self._weights = {term.name: term.weight for term in build.reward_terms(settings.rewards)}
@@ -181,7 +180,7 @@ class FineTuningRun:
             )
         self.log = MetricsLog(run.metrics, run.tensorboard, self.update)
         planned = 2 * settings.evaluation_balls + settings.updates * settings.episodes_per_update
-        self._progress = FineTuningProgress(console, str(run.folder), planned, settings)
+        self._progress = report.FineTuningProgress(console, str(run.folder), planned, settings)
         self._moment = time.monotonic()
 
     def run(self) -> bool:

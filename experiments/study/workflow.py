@@ -79,22 +79,18 @@ class Journal:
         sync_folder(self.path.parent)
         self.steps.append(name)
 
-    def index(self, step: Step) -> int | None:
-        """Index of the step's last mark; None without one."""
-        return max((i for i, name in enumerate(self.steps) if name == step.name), default=None)
-
 
 def list_unfinished(steps: list[Step], journal: Journal) -> list[Step]:
     """The steps that are still to be done, in their order."""
-    makers = {path: step for step in steps for path in step.outputs}
-    left: list[Step] = []
+    makers = {path: step.name for step in steps for path in step.outputs}
+    marks = {name: i for i, name in enumerate(journal.steps)}  # of each step the last one
+    left: dict[str, Step] = {}
     for step in steps:
-        mark = journal.index(step)
-        sources = {makers[path].name: makers[path] for path in step.inputs if path in makers}.values()
-        stale = any(source in left or (journal.index(source) or 0) > (mark or 0) for source in sources)
+        mark, sources = marks.get(step.name), {makers[path] for path in step.inputs if path in makers}
+        stale = any(source in left or marks.get(source, 0) > (mark or 0) for source in sources)
         if mark is None or stale or not all(path.exists() for path in step.outputs):
-            left.append(step)
-    return left
+            left[step.name] = step
+    return list(left.values())
 
 
 def perform(step: Step) -> tuple[str, float]:
