@@ -34,7 +34,7 @@ from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study import blind_protocol
 from experiments.study.analysis import scoring
-from experiments.study.target_domain.hit_log import HitLog
+from experiments.study.target_domain.lab_logs import HitLog
 from experiments.study.workflow import Step, Waiting, derive_seed
 from experiments.training import finalize
 from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
@@ -114,14 +114,14 @@ class RobotWorld:
 
     def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
         """The last balls of the fine-tuning in ``folder``, from the longest session's log."""
-        logs = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_size)
-        if not logs:
+        found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_size)
+        if not found:
             raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
-        flights, joints = session_logs.load(logs[-1])
+        flights, joints = session_logs.load(found[-1])
         strokes = (stroke for t in flights for stroke in split_by_stroke(t))
         kept = sorted((t for t in strokes if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
         if not kept or not joints:
-            raise RunError(f"{logs[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
+            raise RunError(f"{found[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
         begin, end = kept[0].time[0] - AROUND, max(t.time[-1] for t in kept) + AROUND
         tracks = tuple(replace(t, session=name, name=str(i)) for i, t in enumerate(kept))
         return HitLog(Dataset(tracks, name), tuple(r.between(begin, end) for r in joints))

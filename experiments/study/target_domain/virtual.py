@@ -36,8 +36,8 @@ from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.analysis import delays, scoring
-from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.hit_log import HitLog
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.lab_logs import HitLog, record_hits, record_joints
 from experiments.study.workflow import derive_seed
 from experiments.training.update import TrainState
 from mjx_tt.diagnosis.joint import JointRecord
@@ -282,14 +282,14 @@ class VirtualWorld:
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
-        return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
+        return record_joints(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
 
     def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
         """Balls of rallies with the policy of the run ``source``."""
         reality, policy = self.reality, load_policy.load(source).policy
         person, noise = reality.player(player), self._study.reality.camera_noise
         late = models.paths(build.believed(self._study.simulation.model).model)[delays.BALL]
-        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
+        return record_hits(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
