@@ -189,10 +189,8 @@ class ControlSession:
         if self.status is not None and self.status.state != "fault":
             return
         self.send(messages.Reset())
-        for status in self._statuses(RESET_TIME):
-            if not status.faults:
-                return
-        raise RefusedError("the fault is not reset")
+        if not any(not status.faults for status in self._statuses(RESET_TIME)):
+            raise RefusedError("the fault is not reset")
 
     def arm(self) -> None:
         """Arm and wait for the home pose. Raises RefusedError."""

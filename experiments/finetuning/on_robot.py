@@ -16,7 +16,8 @@ from experiments.config.build import Experiment
 from experiments.config.finetuning import FineTuning
 from experiments.deploy.calibration_check import SESSIONS
 from experiments.deploy.control_session import RECOVERIES, ControlSession, load_installed, open_session
-from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
+from experiments.deploy.operator_console import PAUSE, QUIT, Keyboard, View
+from experiments.deploy.recovery import Controls
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.finetuning.robot import LockStepRallies, Operator, PlayedBall, Robot
@@ -84,7 +85,7 @@ class BridgeRobot(Operator):
     repeatable = False
 
     def __init__(self, session: ControlSession, rig: Rig | None, keyboard: Keyboard, view: View) -> None:
-        self._session, self._rig, self._keyboard, self._view = session, rig, keyboard, view
+        self._session, self._rig, self._controls = session, rig, Controls(session, keyboard, view, rig is not None)
         self._paused = self._stopped = self._retracts = False
         self._version = self._credited = 0  # of the policy, of the ball that was returned last
         session.send(Pause(True))
@@ -112,7 +113,9 @@ class BridgeRobot(Operator):
                     refused = True
                 elif isinstance(message, Played):
                     if message.summary.policy_version != self._version:
-                        self._view.say(f"ball {message.summary.ball} was played by an earlier policy: not counted")
+                        self._controls.view.say(
+                            f"ball {message.summary.ball} was played by an earlier policy: not counted"
+                        )
                         continue
                     session.send(Pause(True))
                     if message.summary.fault and self._rig is not None:
@@ -133,7 +136,7 @@ class BridgeRobot(Operator):
                     session.send(exchange)
 
     def _take(self, message: Message) -> None:
-        self._view.take(message)
+        self._controls.take(message)
         if isinstance(message, Discarded):
             self._retracts |= message.number == self._credited != 0
 
@@ -145,18 +148,12 @@ class BridgeRobot(Operator):
             self._keys()
 
     def _keys(self) -> None:
-        key = self._keyboard.pressed()
-        if key not in KEYS:
-            return
-        self._view.say(KEYS[key].text)
-        request = KEYS[key].request
+        key = self._controls.pressed()
         if key == QUIT:
             self._stopped = True
             self._session.send(Stop())  # ends the episode in play, which is then played again
         elif key == PAUSE:
             self._paused = not self._paused
-        elif request is not None:
-            self._session.send(request)
 
     # The operator, asked between episodes
 
