@@ -34,11 +34,9 @@ Attachments = tuple[tuple[str, bytes], ...]
 
 def of_policy(artefact: Artefact, console: Console) -> Attachments:
     """The attachment with a policy's robot; none, with the reason on the console, where it cannot be kept."""
-    return (
-        ()
-        if artefact.contract == PAPER
-        else _kept(lambda: content_of(artefact), f"{artefact.folder}: {RECORDED}", console)
-    )
+    if artefact.contract == PAPER:
+        return ()
+    return _kept(lambda: content_of(artefact), f"{artefact.folder}: {RECORDED}", console)
 
 
 def of_content(content: dict[str, Any], where: str, console: Console) -> Attachments:
