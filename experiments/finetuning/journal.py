@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import RunError
+from experiments.runs import lines
 from robot_io.control.episode import EpisodeSummary
 
 BEFORE, TRAINING, AFTER = "before", "training", "after"
@@ -70,25 +69,16 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: list[Entry] = []
+        self._lines, self._sealed = 0, False  # lines so far, and whether they have checksums
         self._digest = hashlib.sha256()  # of all lines
-        if path.exists():
-            os.truncate(path, self._read())
+        lines.read(path, self._take_line, "episode")
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
-        line = content = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
-        with open(self.path, "ab", buffering=0) as file:
-            start = file.seek(0, os.SEEK_END)
-            try:
-                while line:
-                    line = line[file.write(line) :]
-                os.fsync(file)
-            except OSError:
-                file.truncate(start)  # no half a line in the middle, should there be room again
-                raise
-        if not start:
-            sync_folder(self.path.parent)
-        self._digest.update(content)
+        line = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
+        lines.append(self.path, line)
+        self._lines += 1
+        self._digest.update(line)
         self._take(entry)
 
     def _take(self, entry: Entry) -> None:
@@ -103,30 +93,16 @@ class Journal:
         digest.update(content)
         return content[:-1] + f', "checksum": "{digest.hexdigest()[:16]}"}}\n'.encode()
 
-    def _read(self) -> int:
-        """Reads the entries; length [bytes] of the whole lines."""
-        content, whole = self.path.read_bytes(), 0
-        lines, checked = content.splitlines(keepends=True), False
-        for i, line in enumerate(lines):
-            try:
-                if not line.endswith(b"\n"):
-                    raise ValueError("the line has no end")
-                checked |= _CHECKSUM.search(line) is not None
-                if checked and line != self._checked(_CHECKSUM.sub(b"}", line)):
-                    raise RunError(
-                        f"{self.path}: line {i + 1} was changed, or lines before it were changed, doubled or taken "
-                        "out; restore the file or start a new run"
-                    )
-                self._take(_from_json(json.loads(line)))
-            except (ValueError, TypeError, KeyError) as error:
-                if i == len(lines) - 1:
-                    break
-                raise RunError(
-                    f"{self.path}: line {i + 1} is no episode ({error}); restore the file or start a new run"
-                ) from None
-            self._digest.update(line)
-            whole += len(line)
-        return whole
+    def _take_line(self, line: bytes) -> None:
+        self._sealed |= _CHECKSUM.search(line) is not None
+        if self._sealed and line != self._checked(_CHECKSUM.sub(b"}", line)):
+            raise RunError(
+                f"{self.path}: line {self._lines + 1} was changed, or lines before it were changed, doubled or taken "
+                "out; restore the file or start a new run"
+            )
+        self._take(_from_json(json.loads(line)))
+        self._lines += 1
+        self._digest.update(line)
 
 
 def _to_json(entry: Entry) -> dict[str, Any]:

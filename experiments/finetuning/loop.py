@@ -11,6 +11,7 @@ import hashlib
 import math
 import os
 import time
+from contextlib import closing
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -88,17 +89,8 @@ def finetune(
     with run.locked():
         _open(run, experiment, settings, robot, first, str(source))
         tuning = FineTuningRun(settings, run, robot, operator or Operator(), console, first, network)
-        try:
+        with closing(tuning.log), run_dir.continuable(run.folder, "every episode before", "it"):
             finished = tuning.run()
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
-                "is kept. Make room or repair the folder, then run the same command again to continue"
-            ) from error
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
-        finally:
-            tuning.log.close()
         if not finished:
             console.print(f"{run.folder}: stopped; the same command continues it")
             return None

@@ -152,6 +152,20 @@ class Run:
         return json.loads(self.evaluation.read_text())
 
 
+@contextmanager
+def continuable(folder: Path, kept: str, what: str) -> Iterator[None]:
+    """Says of a disk that refuses, and of a Ctrl-C, what is kept, and that the same command continues ``what``."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{error.filename or folder}: {error.strerror or error}; {kept} is kept. "
+            "Make room or repair the folder, then run the same command again to continue"
+        ) from error
+    except KeyboardInterrupt as stopped:
+        raise KeyboardInterrupt(f"{stopped}\n{folder}: stopped; the same command continues {what}".lstrip()) from None
+
+
 def training_ended(config: Config, update: int, seconds: float, return_rate: float | None) -> str | None:
     """The setting that ends training at this point, or None.
 

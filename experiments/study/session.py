@@ -50,19 +50,11 @@ def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) 
         pipeline = Pipeline(study, folder, console)
         _open(study, folder)
         try:
-            do_steps(study, folder, pipeline.steps(), console, workers)
+            with run_dir.continuable(folder, "every finished step", "the study"):
+                do_steps(study, folder, pipeline.steps(), console, workers)
         except Waiting as waiting:
             console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
             return False
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or folder}: {error.strerror or error}; every finished step is kept. "
-                "Make room or repair the folder, then run the same command again to continue"
-            ) from error
-        except KeyboardInterrupt as stopped:
-            raise KeyboardInterrupt(
-                f"{stopped}\n{folder}: stopped; the same command continues the study".lstrip()
-            ) from None
     console.print(f"report: {folder / REPORT}", highlight=False, soft_wrap=True)
     return True
 

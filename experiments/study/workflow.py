@@ -8,15 +8,14 @@ a study killed at any moment ends as one that was left alone.
 from __future__ import annotations
 
 import json
-import os
 import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import ExperimentError, RunError
+from experiments.runs import lines
 
 
 class Waiting(ExperimentError):
@@ -54,29 +53,11 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path, self.steps = path, list[str]()
-        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-        whole = 0
-        for i, line in enumerate(lines):
-            try:
-                name = json.loads(line)["step"]
-            except (ValueError, KeyError, TypeError) as error:
-                if i < len(lines) - 1:
-                    raise RunError(f"{path}: line {i + 1} is no step ({error}); restore the file") from None
-                break
-            if not line.endswith(b"\n"):
-                break
-            self.steps.append(name)
-            whole += len(line)
-        if path.exists():
-            os.truncate(path, whole)
+        lines.read(path, lambda line: self.steps.append(json.loads(line)["step"]), "step")
 
     def append(self, name: str, seconds: float) -> None:
         """Marks a step as done. Raises OSError."""
-        with open(self.path, "ab") as file:
-            file.write(json.dumps({"step": name, "seconds": round(seconds, 2)}).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        sync_folder(self.path.parent)
+        lines.append(self.path, json.dumps({"step": name, "seconds": round(seconds, 2)}).encode() + b"\n")
         self.steps.append(name)
 
 
