@@ -96,9 +96,9 @@ def train(
     with interruptible():
         ok = sweep.run_all(planned, screen, Path(out), Workers(side_by_side, elsewhere, str(site)))
         if select and ok:
-            from experiments.study.target_domain import on_robot
+            from experiments.study.target_domain import play_on_robot
 
             for name in dict.fromkeys(job.config.name for job in planned):
                 seeded = [job for job in planned if job.config.name == name]
-                sweep.select(Path(out) / name, seeded, screen, robot, on_robot.score)
+                sweep.select(Path(out) / name, seeded, screen, robot, play_on_robot.score)
     return 0 if ok else 1

@@ -2,7 +2,7 @@
 
 For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while
 the player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is
-a virtual one (``target_domain.virtual``) or a robot with its operator (``target_domain.on_robot``). Trainings are
+a virtual one (``target_domain.virtual``) or a robot with its operator (``target_domain.play_on_robot``). Trainings are
 ordinary runs: several seeds of a model, the best in reality chosen.
 """
 
@@ -33,7 +33,7 @@ from experiments.study.analysis import scoring
 from experiments.study.paths import EVALUATIONS, JOINTS, POLICY, REPORT, StudyPaths
 from experiments.study.schedule import Human, Identified, Real, Simulated, count_updates, list_items, list_pairings
 from experiments.study.target_domain import hidden_effects
-from experiments.study.target_domain.on_robot import RobotWorld, make_blind_steps, make_rally_step
+from experiments.study.target_domain.play_on_robot import RobotWorld, make_blind_steps, make_rally_step
 from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld, play_rallies
 from experiments.study.workflow import Step, derive_seed
 from experiments.training.loop import train

@@ -30,7 +30,7 @@ from experiments.study import identification
 from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
 from experiments.study.pipeline import Pipeline, make_config
 from experiments.study.schedule import Simulated, list_items
-from experiments.study.target_domain import on_robot
+from experiments.study.target_domain import play_on_robot
 from experiments.study.workflow import Journal, Step, Waiting, list_unfinished, perform
 
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
@@ -70,7 +70,7 @@ def look_up(study: Study) -> None:
         with error_context("identification"):
             identification.read_prior(study.identification.prior, "prior")
     if study.robot is not None:
-        on_robot.look_up(study, study.robot)
+        play_on_robot.look_up(study, study.robot)
 
 
 def _open(study: Study, folder: Path) -> None:

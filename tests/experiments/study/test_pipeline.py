@@ -38,7 +38,7 @@ from experiments.study.analysis.paper import TEN
 from experiments.study.pipeline import Pipeline, make_config
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
-from experiments.study.target_domain.on_robot import make_blind_steps
+from experiments.study.target_domain.play_on_robot import make_blind_steps
 from experiments.study.target_domain.virtual import VirtualReality
 from experiments.study.workflow import Journal, Step, Waiting, list_unfinished
 from mjx_tt.env import reward_weights

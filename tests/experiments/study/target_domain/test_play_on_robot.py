@@ -26,8 +26,8 @@ from experiments.runs.run_dir import Run
 from experiments.study import identification
 from experiments.study.analysis import scoring
 from experiments.study.analysis.identified import LOGS, list_estimates
-from experiments.study.target_domain import on_robot
-from experiments.study.target_domain.on_robot import make_rally_step
+from experiments.study.target_domain import play_on_robot
+from experiments.study.target_domain.play_on_robot import make_rally_step
 from experiments.study.workflow import derive_seed
 from experiments.training import sweep
 from experiments.training.sweep import Job
@@ -43,9 +43,9 @@ POLICY = ROOT / "experiments/shipped/policies/quickstart"
 PLAYED, LATE = 40, 0.02  # balls of a session; [s] by which the second robot obeys later
 
 
-def world() -> on_robot.RobotWorld:
+def world() -> play_on_robot.RobotWorld:
     data = {"name": "x", "robot": "rig", "simulation": {"rounds": [{"simulated": 1, "real": 1}] * 3}}
-    return on_robot.RobotWorld(study_config.parse(data, "study"), "rig", None)
+    return play_on_robot.RobotWorld(study_config.parse(data, "study"), "rig", None)
 
 
 def test_a_rallys_track_is_parted_at_the_persons_strokes():
@@ -54,7 +54,7 @@ def test_a_rallys_track_is_parted_at_the_persons_strokes():
     time = np.arange(0.0, 2.2, 0.008)
     y = np.interp(time, *zip(*places, strict=True)) + np.random.default_rng(0).normal(0.0, 0.003, time.size)
     track = Trajectory("s", "1", time, np.stack([0.0 * y, y, 0.2 + 0.0 * y]))
-    parts = on_robot.split_by_stroke(track)
+    parts = play_on_robot.split_by_stroke(track)
     assert [round(float(p.time[0]), 1) for p in parts] == [0.0, 1.0] and sum(map(len, parts)) == time.size
     assert all(p.position[1].min() < -1.1 < 1.1 < p.position[1, 0] for p in parts)
 
@@ -67,7 +67,7 @@ def test_a_fine_tuning_without_a_log_is_told_so(tmp_path):
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "D0.csv"
-    balls = on_robot.serve_balls("player3", 40, 3, "D0")
+    balls = play_on_robot.serve_balls("player3", 40, 3, "D0")
     assert len(balls) == 40 and all(t.position[1, 0] > 0.5 and t.position[1].min() < 0.0 for t in balls)
     measurements.write_csv(path, balls)
     return path
@@ -161,7 +161,7 @@ def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
     monkeypatch.setattr(play, "run", rig.run)
-    monkeypatch.setattr(on_robot, "export_once", lambda trained, console: run)
+    monkeypatch.setattr(play_on_robot, "export_once", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
     return make_rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
 
@@ -208,7 +208,7 @@ BALLS = 3  # by which a test chooses
 
 def score(trained, robot, balls, seed, console) -> float:
     assert robot == "lockstep" and balls == 50  # the paper's number, of which a test plays fewer
-    return on_robot.score(trained, robot, BALLS, seed, console)
+    return play_on_robot.score(trained, robot, BALLS, seed, console)
 
 
 @pytest.mark.slow
@@ -224,7 +224,7 @@ def test_the_seed_that_plays_best_on_the_emulated_robot_is_chosen(tmp_path, monk
         points = {"missed": 0, "hit": 1, "returned": 2}
         worth.append(sum(-2 if one.fault else points[one.outcome] for one in played) / BALLS)
     assert worth[0] > worth[1]
-    assert on_robot.score(bad, "lockstep", BALLS, good.config.evaluation.seed + 1, Console()) == worth[1]
+    assert play_on_robot.score(bad, "lockstep", BALLS, good.config.evaluation.seed + 1, Console()) == worth[1]
     jobs = [Job(good.config, Run(tmp_path / "seed0"), "test")]
     shutil.copytree(POLICY, jobs[0].run.folder)
     sweep.select(tmp_path, jobs, Console(file=io.StringIO()), "lockstep", score)
