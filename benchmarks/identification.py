@@ -32,7 +32,8 @@ from experiments.runs.run_dir import Run
 from experiments.stats import wilson
 from experiments.study import identification
 from experiments.study.analysis.identified import LOGS, holds, list_estimates
-from experiments.study.target_domain import hidden_effects, hit_log, joint_log
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.lab_logs import record_hits, record_joints
 from experiments.study.target_domain.virtual import VirtualReality
 from experiments.training.loop import train
 from mjx_tt import platform
@@ -120,10 +121,10 @@ def of_reality(
     person, whole = reality.player(player), jax.random.key(seed)
     keys = [*jax.random.split(whole, 6), jax.random.fold_in(whole, 6)]
     measurements.write_csv(_made(folder) / "D0.csv", reality.first_balls(person, logged[0], keys[0], "D0"))
-    records = joint_log.record(reality.simulator.task, reality.known, keys[1], logged[1])
+    records = record_joints(reality.simulator.task, reality.known, keys[1], logged[1])
     identification.write_joints(folder / "joints", records)
     policy = load_policy.load(QUICKSTART).policy
-    log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE, BELIEVED)
+    log = record_hits(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE, BELIEVED)
     identification.write_hits(folder / "hits", log.balls, log.joints)
     prior = identification.read_prior(studies.PRIOR, "prior")
     worlds = {"nominal": ModelFile(SimModel()), "prior": ModelFile(SimModel(), prior)}

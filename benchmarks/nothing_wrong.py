@@ -22,7 +22,8 @@ from experiments.config import study as studies
 from experiments.deploy import session_logs
 from experiments.runs import load_policy, run_dir
 from experiments.stats import wilson
-from experiments.study.target_domain import hidden_effects, hit_log, joint_log
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.lab_logs import record_hits, record_joints
 from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt import platform
 from mjx_tt.diagnosis.diagnose import diagnose
@@ -61,14 +62,14 @@ class Nominal:
         player = self.reality.player(PLAYERS[seed % len(PLAYERS)])
         thrown = _lobs(player, human_player.fresh((BALLS,)), key, (BALLS,))
         seen = hidden_effects.measure(self.model, thrown, NOISE, camera)
-        joints = joint_log.record(self.reality.simulator.task, self.model, swept, SECONDS)
+        joints = record_joints(self.reality.simulator.task, self.model, swept, SECONDS)
         return Logs(tuple(seen.trajectories("nominal")), joints, {})
 
     def hits(self, seed: int) -> Logs:
         """Balls of rallies with the hits in them."""
         player = self.reality.player(PLAYERS[seed % len(PLAYERS)])
         key = jax.random.key(seed)
-        found = hit_log.record(self.reality.simulator, self.model, player, self.policy, key, "nominal", NOISE, LATE)
+        found = record_hits(self.reality.simulator, self.model, player, self.policy, key, "nominal", NOISE, LATE)
         return Logs(tuple(found.balls), found.joints, {})
 
 

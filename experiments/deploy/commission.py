@@ -11,23 +11,30 @@ import hashlib
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import yaml
+from rich.console import Console
+from rich.prompt import Prompt
 
 from ballmodel.constants import BALL_RADIUS, PADDLE_RADIUS, TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.io.atomic_files import replacing
+from experiments.deploy.control_session import ControlSession
 from robot_io.contract import PAPER, Contract
 from robot_io.control import messages
 from robot_io.control.config import RobotConfig, axis_range
-from robot_io.control.messages import Message, Request, Status
+from robot_io.control.messages import Message, Status
 from robot_io.errors import RefusedError
 from robot_io.safety.clearance import RobotGeometry
 
+STEPS = (  # in order
+    "network versions tool limits clock tracker bounces base_values comm_timeout homing emergency_stop pose signs "
+    "latency speed position_gain stop calibration first_ball"
+).split()
 SLOW, FAST = 0.1, 1.0  # share of the policy's speed at speed_scale 0.1: 1 % and 10 %
 SCALE = 0.1  # highest speed_scale of this command
 WAIT, SHORT = 30.0, 1.0  # [s] for something to happen, and for an emergency stop to be noticed
@@ -57,26 +64,33 @@ class NotProven(RefusedError):
     """A step was not proven; the message says what was measured, what was expected, and what to do."""
 
 
-class Session(Protocol):
-    """``ControlSession``, or one that behaves the same."""
+class Terminal:
+    """The person at the terminal. While a question waits nothing is armed that moves: silence disarms."""
 
-    status: Status | None
-
-    def send(self, request: Request) -> None: ...
-
-    def messages(self, seconds: float) -> Iterator[Message]: ...
-
-
-class Operator(Protocol):
-    """The person at the robot."""
+    def __init__(self, console: Console) -> None:
+        self._console = console
 
     def ask(self, key: str, question: str) -> str:
         """The answer to a question."""
+        return Prompt.ask(question, console=self._console)
 
     def do(self, key: str, instruction: str) -> None:
         """Returns when it is done."""
+        Prompt.ask(f"{instruction}; then press Enter", console=self._console, default="", show_default=False)
 
-    def say(self, text: str) -> None: ...
+    def say(self, text: str) -> None:
+        self._console.print(text)
+
+
+def take(session: ControlSession, accept: Callable[[Message], bool], seconds: float) -> Any:
+    """The first new message that is accepted; None: none came in time. Raises RefusedError for a refusal."""
+    for _ in range(round(seconds / 0.1)):
+        for message in session.messages(0.1):
+            if accept(message):
+                return message
+            if isinstance(message, messages.Refused):
+                raise message.error
+    return None
 
 
 @dataclass
@@ -110,15 +124,15 @@ class Record:
 
 
 class Commissioning:
-    """Steps on one robot.
+    """Steps on one robot: each is a method that returns what it has proven, and raises NotProven.
 
     begin_play  makes a session that plays balls at ``SCALE``, with a policy; None: there is none
     """
 
     def __init__(
         self,
-        session: Session,
-        operator: Operator,
+        session: ControlSession,
+        operator: Terminal,
         config: RobotConfig,
         record: Record,
         contract: Contract = PAPER,
@@ -130,40 +144,15 @@ class Commissioning:
         self._axes, self._arm = list(contract.carrying), list(contract.arm)
         self._clip: np.ndarray | None = None  # the ball's place on the blade (3,) [m], in the last joint's frame
 
-    @property
-    def steps(self) -> dict[str, Callable[[], str]]:
-        """By name, in order; each returns what it has proven and raises NotProven."""
-        return {
-            "network": self._network,
-            "versions": self._versions,
-            "tool": self._tool,
-            "limits": self._limits,
-            "clock": self._clock,
-            "tracker": self._tracker,
-            "bounces": self._bounces,
-            "base_values": self._base_values,
-            "comm_timeout": self._comm_timeout,
-            "homing": self._homing,
-            "emergency_stop": self._emergency_stop,
-            "pose": self._pose,
-            "signs": self._signs,
-            "latency": self._latency,
-            "speed": self._speed,
-            "position_gain": self._position_gain,
-            "stop": self._stop,
-            "calibration": self._calibration,
-            "first_ball": self._first_ball,
-        }
-
     def run(self) -> None:
         """Every step that is not proven yet. Raises NotProven at the first that cannot be, RefusedError."""
-        for number, (name, step) in enumerate(self.steps.items(), 1):
-            head = f"{number:2d}/{len(self.steps)} {name}"
+        for number, name in enumerate(STEPS, 1):
+            head = f"{number:2d}/{len(STEPS)} {name}"
             if name in self._record.proven:
                 self._operator.say(f"{head}: proven {self._record.proven[name]['date']}")
                 continue
             try:
-                text = step()
+                text = getattr(self, f"_{name}")()
             except RefusedError as error:
                 raise NotProven(f"{name}: {error}") from None
             self._record.add(name, text)
@@ -300,7 +289,7 @@ class Commissioning:
             "clip the ball to the side of the blade, touching its edge, square to the handle; stay clear",
         )
         seen = self._ball("pose")
-        hand, self._clip, off = self._hand(self._measured()), None, math.inf
+        hand, self._clip, off = self._geometry.hand(self._measured()[:, None])[0], None, math.inf
         for side in (1.0, -1.0):
             along = self._geometry.blade / np.linalg.norm(self._geometry.blade)
             clip = self._geometry.blade + side * (PADDLE_RADIUS + BALL_RADIUS) * np.cross(self._geometry.normal, along)
@@ -463,15 +452,7 @@ class Commissioning:
 
     def _until(self, condition: Callable[[Status], bool], seconds: float) -> Status | None:
         """The first new status that fulfils a condition; None: none did in time. Raises RefusedError for a refusal."""
-        waited = 0.0
-        while waited < seconds:
-            for message in self._session.messages(0.1):
-                if isinstance(message, messages.Refused):
-                    raise message.error
-                if isinstance(message, Status) and condition(message):
-                    return message
-            waited += 0.1
-        return None
+        return take(self._session, lambda m: isinstance(m, Status) and condition(m), seconds)
 
     def _wait(self, condition: Callable[[Status], bool], what: str) -> Status:
         status = self._until(condition, WAIT)
@@ -481,13 +462,10 @@ class Commissioning:
         return status
 
     def _answer(self, kind: type[Any], seconds: float) -> Any:
-        for _ in range(round(seconds / 0.1)):
-            for message in self._session.messages(0.1):
-                if isinstance(message, kind):
-                    return message
-                if isinstance(message, messages.Refused):
-                    raise message.error
-        raise NotProven(f"the control process sent no {kind.__name__} within {seconds:g} s")
+        answer = take(self._session, lambda m: isinstance(m, kind), seconds)
+        if answer is None:
+            raise NotProven(f"the control process sent no {kind.__name__} within {seconds:g} s")
+        return answer
 
     def _switch_on(self) -> None:
         """Motors, RAPID and EGM on."""
@@ -528,12 +506,9 @@ class Commissioning:
     def _measured(self) -> np.ndarray:
         return np.array([position for _, _, position, _ in self._last().joints])
 
-    def _hand(self, q: np.ndarray) -> np.ndarray:
-        return self._geometry.hand(q[:, None])[0]
-
     def _clipped(self, q: np.ndarray) -> np.ndarray:
         """Where the ball on the blade is (3,) [m] at joint positions q (n,)."""
-        hand = self._hand(q)
+        hand = self._geometry.hand(q[:, None])[0]
         return hand[:3, :3] @ self._clip + hand[:3, 3]
 
     def _ball(self, what: str) -> np.ndarray:

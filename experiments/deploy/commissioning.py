@@ -11,14 +11,14 @@ from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import robot_attachment
-from experiments.deploy.control_session import ControlSession
+from experiments.deploy.control_session import start_session
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.errors import ConfigError, error_context
 from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import Calibration
 from robot_io.calibration import points
 from robot_io.contract import PAPER, Contract
-from robot_io.control import messages, process
+from robot_io.control import messages
 from robot_io.control.messages import Request
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
@@ -106,19 +106,15 @@ def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: boo
         return f"not noted: {reasons}"
     columns = [*points.TABLE, *points.BALL, *contract.joints]
     new = not path.exists()
-    if not new and (there := _columns(path)) != columns:
-        return f"not noted: {path} has the columns {', '.join(there)}; allowed with {contract.robot}: another file"
-    with open(path, "a", encoding="utf-8", newline="") as stream:
+    with open(path, "a+", encoding="utf-8", newline="") as stream:
+        stream.seek(0)
+        if not new and (there := next(csv.reader(stream), [])) != columns:
+            return f"not noted: {path} has the columns {', '.join(there)}; allowed with {contract.robot}: another file"
         lines = csv.DictWriter(stream, columns, restval="")
         if new:
             lines.writeheader()
         lines.writerow({name: f"{value:.6f}" for name, value in values.items()})
     return f"noted in {path}{reasons and f' ({reasons})'}; fill in table_x, table_y, table_z of its last line"
-
-
-def _columns(path: Path) -> list[str]:
-    with open(path, encoding="utf-8", newline="") as stream:
-        return next(csv.reader(stream), [])
 
 
 @dataclass(frozen=True)
@@ -150,25 +146,20 @@ class Commissioning:
     def _operate(self, console: Console, policy: Path | None, dry: bool) -> int:
         contract, attached = self._load_contract(policy, console)
         config = robots.load_robot(self.robot, contract=contract)
-        self.log_folder.mkdir(parents=True, exist_ok=True)
-        options = process.ControlOptions(
-            None if policy is None else str(policy),
-            log_folder=str(self.log_folder),
-            log_name=f"{time.strftime('%Y%m%d-%H%M%S')}-{'check' if dry else 'jog'}",
-            attachments=(
-                ("robot.yaml", self.robot.read_text(encoding="utf-8")),
-                ("calibration.yaml", robots.to_yaml(config.calibration)),
-                *attached,
-            ),
-            dry=dry,
-            jog=not dry,
-            contract=contract,
-        )
         title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
         keys, jogger = CHECK_KEYS if dry else jog_keys(contract), Jogger(contract)
-        with ControlSession(config, options, console) as session:
-            for line in session.report:
-                console.print(f"  {line}")
+        with start_session(
+            config,
+            contract,
+            self.log_folder,
+            console,
+            "-check" if dry else "-jog",
+            self.robot.read_text(encoding="utf-8"),
+            attached,
+            artefact=None if policy is None else str(policy),
+            dry=dry,
+            jog=not dry,
+        ) as session:
             end = time.monotonic() + (float("inf") if self.seconds is None else self.seconds)
             with Keyboard() as keyboard, View(console, title, keys) as view:
                 while time.monotonic() < end:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console
 
@@ -189,10 +189,8 @@ class ControlSession:
         if self.status is not None and self.status.state != "fault":
             return
         self.send(messages.Reset())
-        for status in self._statuses(RESET_TIME):
-            if not status.faults:
-                return
-        raise RefusedError("the fault is not reset")
+        if not any(not status.faults for status in self._statuses(RESET_TIME)):
+            raise RefusedError("the fault is not reset")
 
     def arm(self) -> None:
         """Arm and wait for the home pose. Raises RefusedError."""
@@ -236,15 +234,8 @@ class ControlSession:
         self.pipe.close()
 
 
-class Installed(NamedTuple):
-    """A real robot: its robot.yaml, and the contract of the robot that stands there."""
-
-    config: RobotConfig
-    contract: Contract
-
-
-def load_installed(robot: str, policy: str | Path, contract: Contract, logs: Path) -> Installed:
-    """The robot of a robot.yaml, for a policy of this contract.
+def load_installed(robot: str, policy: str | Path, contract: Contract, logs: Path) -> tuple[RobotConfig, Contract]:
+    """The robot of a robot.yaml, for a policy of this contract, and the contract of the one that stands there.
 
     Raises ArtefactError for a policy of another robot, ConfigError where the newest session in ``logs`` contradicts the
     calibration, or where a robot is to be fast whose tracker has never been shown a point at a known place.
@@ -260,14 +251,14 @@ def load_installed(robot: str, policy: str | Path, contract: Contract, logs: Pat
             "no ball shows that x is mirrored, or the frame moved along the table. Calibrate it (mjx-tt calibrate "
             f"tracker), or play at {fast}"
         )
-    return Installed(config, standing)
+    return config, standing
 
 
 @contextmanager
 def open_session(
     policy: artefacts.Artefact,
     robot: str,
-    installed: Installed | None,
+    installed: tuple[RobotConfig, Contract] | None,
     log_folder: Path,
     console: Console,
     setup: RobotOptions,
@@ -280,25 +271,51 @@ def open_session(
             config, contract, text = rig.robot, policy.contract, robots.to_yaml(rig.robot)
         else:
             rig, (config, contract), text = None, installed, Path(robot).read_text(encoding="utf-8")
-        options = process.ControlOptions(
-            str(policy.folder),
-            setup.backend,
-            str(log_folder),
-            time.strftime("%Y%m%d-%H%M%S"),
-            box_of(policy),
-            (("git", json.dumps(run_dir.git_state())),),
-            (
-                ("robot.yaml", text),
-                ("calibration.yaml", robots.to_yaml(config.calibration)),
-                *robot_attachment.of_policy(policy, console),
-            ),
-            contract=contract,
+        session = start_session(
+            config,
+            contract,
+            log_folder,
+            console,
+            robot_yaml=text,
+            attached=robot_attachment.of_policy(policy, console),
+            artefact=str(policy.folder),
+            backend=setup.backend,
+            box=box_of(policy),
+            metadata=(("git", json.dumps(run_dir.git_state())),),
         )
-        log_folder.mkdir(parents=True, exist_ok=True)
-        session = stack.enter_context(ControlSession(config, options, console))
-        for line in session.report:
-            console.print(f"  {line}")
-        yield session, rig
+        yield stack.enter_context(session), rig
+
+
+def start_session(
+    config: RobotConfig,
+    contract: Contract,
+    log_folder: Path,
+    console: Console,
+    kind: str = "",
+    robot_yaml: str | None = None,
+    attached: robot_attachment.Attachments = (),
+    **options: Any,
+) -> ControlSession:
+    """A session whose log is named by the time and ``kind``, and holds robot.yaml, calibration and what is attached.
+
+    options: others of ``ControlOptions``. Raises RefusedError when it does not start.
+    """
+    log_folder.mkdir(parents=True, exist_ok=True)
+    chosen = process.ControlOptions(
+        log_folder=str(log_folder),
+        log_name=f"{time.strftime('%Y%m%d-%H%M%S')}{kind}",
+        attachments=(
+            *(() if robot_yaml is None else (("robot.yaml", robot_yaml),)),
+            ("calibration.yaml", robots.to_yaml(config.calibration)),
+            *attached,
+        ),
+        contract=contract,
+        **options,
+    )
+    session = ControlSession(config, chosen, console)
+    for line in session.report:
+        console.print(f"  {line}")
+    return session
 
 
 def _wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:

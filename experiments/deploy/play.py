@@ -15,15 +15,15 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy import calibration_check, session_report
 from experiments.deploy.control_session import RECOVERIES, ControlSession, load_installed, open_session
-from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyboard, View
-from experiments.deploy.recovery import Recovery
+from experiments.deploy.operator_console import PAUSE, QUIT, Keyboard, View
+from experiments.deploy.recovery import Controls
 from experiments.deploy.session_report import PlayedSession
 from experiments.interrupts import stop_requested
 from experiments.options import RIG, RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
-from robot_io.control.messages import Discarded, Message, Pause, Played, RallyOver, Refused, Status
+from robot_io.control.messages import Discarded, Message, Pause, Played, RallyOver
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.log import view as log_view
@@ -66,7 +66,8 @@ def run(
                 Keyboard() as keyboard,
                 View(console, f"{artefact} on {session.robot.name}") as view,
             ):
-                problem = _Play(session, rig, keyboard, view, played, balls, rallies, seconds, stop).run()
+                controls = Controls(session, keyboard, view, rig is not None)
+                problem = _Play(session, rig, controls, played, balls, rallies, seconds, stop).run()
             if stop.is_set():
                 raise KeyboardInterrupt
             status = 1 if problem else 0
@@ -110,14 +111,12 @@ class _Play:
 
     session: ControlSession
     rig: Rig | None
-    keyboard: Keyboard
-    view: View
+    controls: Controls
     played: PlayedSession
     balls: int | None
     rallies: int | None
     seconds: float | None
     stop: threading.Event
-    recovery: Recovery | None = None
     faults_in_a_row: int = 0
     heard: float = 0.0  # when the last ball was played
 
@@ -131,20 +130,19 @@ class _Play:
                 break
             for message in self.session.messages(0.1):
                 self._take(message)
-            if self._press(self.keyboard.pressed()):
+            key = self.controls.pressed()
+            if key == QUIT:
                 break
+            if key == PAUSE:
+                self.session.send(Pause(not (self.session.status and self.session.status.paused)))
             if self.rig is not None and (problem := self._watch_rig(self.rig)):
                 return problem
         return None
 
     def _take(self, message: Message) -> None:
-        self.view.take(message)
+        self.controls.take(message)
         console = self.session.console
-        if isinstance(message, Refused) and self.recovery is not None and self.recovery.refused(message):
-            self.recovery = None
-        elif isinstance(message, Status) and self.recovery is not None:
-            self._continue(self.recovery, message)
-        elif isinstance(message, Played):
+        if isinstance(message, Played):
             self.heard = time.monotonic()
             self.played.episodes.append(message.summary)
             self.faults_in_a_row = self.faults_in_a_row if message.summary.fault else 0
@@ -158,37 +156,6 @@ class _Play:
             if not console.is_terminal and self.balls is None:  # who counts balls may have a launcher
                 touches = f"{rally.length} touch{'es' * (rally.length != 1)}"
                 console.print(f"rally {rally.number}: {touches}: {rally.text}")
-
-    def _continue(self, recovery: Recovery, status: Status) -> None:
-        """One step of a recovery."""
-        try:
-            request = recovery.step(status, time.monotonic())
-        except TimeoutError as error:
-            self.view.say(str(error))
-            self.recovery = None
-            return
-        if request is not None:
-            self.session.send(request)
-        if recovery.message:
-            self.view.say(recovery.message)
-        if recovery.done:
-            self.recovery = None
-
-    def _press(self, key: str | None) -> bool:
-        """Does what a key asks for; True for the one that ends."""
-        session = self.session
-        if key is not None:  # whatever it is, the operator wants something else
-            emulated = self.rig is not None
-            self.recovery = Recovery(time.monotonic(), session.status, emulated) if key == RECOVER else None
-        if key == QUIT:
-            return True
-        if key == PAUSE:
-            session.send(Pause(not (session.status and session.status.paused)))
-        elif key in KEYS and (request := KEYS[key].request) is not None:
-            session.send(request)
-        if key in KEYS:
-            self.view.say(KEYS[key].text)
-        return False
 
     def _watch_rig(self, rig: Rig) -> str | None:
         """Brings the rig back after a fault; returns the reason where that fails, or where no ball comes."""

@@ -1,8 +1,12 @@
-"""The operator's one key after a fault: axes on, reset, home, arm, each once nothing stands against it."""
+"""The operator's keys in a session, and the one after a fault: axes on, reset, home, arm, each when it is safe."""
 
 from __future__ import annotations
 
-from robot_io.control.messages import Arm, Prepare, Refused, Request, Reset, Status
+import time
+
+from experiments.deploy.control_session import ControlSession
+from experiments.deploy.operator_console import KEYS, RECOVER, Keyboard, View
+from robot_io.control.messages import Arm, Message, Prepare, Refused, Request, Reset, Status
 from robot_io.safety.faults import Cause
 
 LONGEST = 20.0  # [s] from the key, or from the end of the axes' search, until the robot is armed
@@ -84,3 +88,46 @@ def only_unprepared(status: Status) -> bool:
     """Nothing is missing or present but axes without power or reference, which Prepare gives them."""
     others = set(status.present) - {Cause.AXIS_LOST.value}
     return not (status.arm or status.ramping or status.tracker or others) and (not status.axes or status.preparable)
+
+
+class Controls:
+    """Keys and view of a session, with the recovery that a key begins. emulated: as of ``Recovery``."""
+
+    def __init__(self, session: ControlSession, keyboard: Keyboard, view: View, emulated: bool) -> None:
+        self._session, self._keyboard, self.view, self._emulated = session, keyboard, view, emulated
+        self._recovery: Recovery | None = None
+
+    def take(self, message: Message) -> None:
+        """Shows a message of the session, and does the step of a recovery that is due."""
+        self.view.take(message)
+        if self._recovery is not None and not self._goes_on(self._recovery, message):
+            self._recovery = None
+
+    def _goes_on(self, recovery: Recovery, message: Message) -> bool:
+        """Does the step that is due; False when the recovery has ended."""
+        if isinstance(message, Refused):
+            return not recovery.refused(message)
+        if not isinstance(message, Status):
+            return True
+        try:
+            request = recovery.step(message, time.monotonic())
+        except TimeoutError as error:
+            self.view.say(str(error))
+            return False
+        if request is not None:
+            self._session.send(request)
+        if recovery.message:
+            self.view.say(recovery.message)
+        return not recovery.done
+
+    def pressed(self) -> str | None:
+        """The key that was pressed, if any; its request has been sent."""
+        key = self._keyboard.pressed()
+        if key is not None:  # whatever it is, the operator wants something else
+            begins = key == RECOVER
+            self._recovery = Recovery(time.monotonic(), self._session.status, self._emulated) if begins else None
+        if key in KEYS:
+            if (request := KEYS[key].request) is not None:
+                self._session.send(request)
+            self.view.say(KEYS[key].text)
+        return key

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -120,24 +121,13 @@ def serve(
     with Rig(str(standing.scene()), throws, params, chosen, standing.contract) as running, Keyboard() as keyboard:
         out.write_text(robots.to_yaml(replace(running.robot, robot=named)), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}")
-        throwing, connected = False, True
-
-        def throw() -> None:
-            nonlocal throwing
-            throwing = not throwing
-            running.throw(throwing)
-
-        def plug() -> None:
-            nonlocal connected
-            connected = not connected
-            running.connect_axis(0, connected)
-
+        throwing, plugged = cycle((True, False)), cycle((False, True))
         keys: dict[str, tuple[str, Callable[[], object]]] = {
             "o": ("switch the arm on", running.switch_on),
-            "b": ("throw balls, or stop", throw),
+            "b": ("throw balls, or stop", lambda: running.throw(next(throwing))),
             "e": ("emergency stop", running.motors_off),
             **({"f": ("drive fault", lambda: running.drive_fault(0, 0x31))} if axes else {}),
-            **({"c": ("pull or plug an axis's cable", plug)} if axes else {}),
+            **({"c": ("pull or plug an axis's cable", lambda: running.connect_axis(0, next(plugged)))} if axes else {}),
             "t": ("tracker silent for 1 s", lambda: running.drop_out(1.0)),
         }
         console.print("   ".join(f"[{key}] {text}" for key, (text, _) in keys.items()) + "   [q] end")

@@ -11,6 +11,7 @@ import json
 import shutil
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import Any
 from xml.etree import ElementTree
@@ -35,23 +36,20 @@ def of_policy(artefact: Artefact, console: Console) -> Attachments:
     """The attachment with a policy's robot; none, with the reason on the console, where it cannot be kept."""
     if artefact.contract == PAPER:
         return ()
-    try:
-        return of_content(content_of(artefact), f"{artefact.folder}: {RECORDED}", console)
-    except ConfigError as error:
-        return _left_out(error, console)
+    return _kept(lambda: content_of(artefact), f"{artefact.folder}: {RECORDED}", console)
 
 
 def of_content(content: dict[str, Any], where: str, console: Console) -> Attachments:
     """As ``of_policy`` with the plain data of a robot, which ``where`` is the origin of."""
+    return _kept(lambda: content, where, console)
+
+
+def _kept(content: Callable[[], dict[str, Any]], where: str, console: Console) -> Attachments:
     try:
-        return ((NAME, pack(content, where)),)
+        return ((NAME, pack(content(), where)),)
     except ConfigError as error:
-        return _left_out(error, console)
-
-
-def _left_out(error: ConfigError, console: Console) -> Attachments:
-    console.print(f"the log will not hold the robot for mjx-tt view: {error}", style="yellow")
-    return ()
+        console.print(f"the log will not hold the robot for mjx-tt view: {error}", style="yellow")
+        return ()
 
 
 def pack(content: dict[str, Any], where: str) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,9 +13,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import chi2
 
 from ballmodel.io import MeasuredStates, SpinDataset, read, read_events, read_spindoe
-from ballmodel.io.atomic_files import replacing
 from ballmodel.io.formats import INDEX
 from experiments.errors import ConfigError
+from experiments.runs import run_dir
 from mjx_tt.prediction.benchmark import WINDOW, Benchmark, Score, benchmark, landing_benchmark
 from mjx_tt.sim.model import SimModel
 from mjx_tt.viz import html
@@ -66,16 +65,14 @@ def _is_events(path: Path) -> bool:
 def write(folder: Path, found: Sequence[tuple[Benchmark, str]]) -> list[Path]:
     """Writes benchmark.csv and benchmark.html with its pictures; returns the paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    table = folder / "benchmark.csv"
-    with replacing(table) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for b, licence in found:
-            for s in b.scores:
-                millimetres = [f"{1e3 * v:.2f}" for v in (*s.rms, *s.median)]
-                writer.writerow(
-                    [b.name, licence, f"{s.horizon:g}", s.across, s.method, s.flights, *millimetres, f"{s.inside:.3f}"]
-                )
+    table, rows = folder / "benchmark.csv", []
+    for b, licence in found:
+        for s in b.scores:
+            millimetres = [f"{1e3 * v:.2f}" for v in (*s.rms, *s.median)]
+            rows.append(
+                [b.name, licence, f"{s.horizon:g}", s.across, s.method, s.flights, *millimetres, f"{s.inside:.3f}"]
+            )
+    run_dir.write_csv(table, COLUMNS, rows)
     page = Page("Predicting balls", f"the state from the first {WINDOW:g} s, every second flight held out")
     for b, licence in found:
         page.section(b.name, b.name)

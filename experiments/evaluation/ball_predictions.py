@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
 
-from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError
+from experiments.runs import run_dir
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.flight_fit import Belief, fit_states, fly_on, learn
 from mjx_tt.sim.model import SimModel
@@ -40,13 +39,12 @@ def write(path: Path, measured: Dataset, model: SimModel, horizons: tuple[float,
     fitted = fit_states(parts, belief)
     ahead = np.array([[t.time[-1] - t.time[0] + h for t in parts] for h in horizons])
     flown, covariance = fly_on(fitted, ahead)
+    rows = []
+    for n, t in enumerate(parts):
+        for h in range(len(horizons)):
+            place, spread = flown.position[:, 1 + h, 0, n], covariance[n, h]
+            numbers = [t.time[0] + ahead[h, n], *place, *np.sqrt(np.diag(spread)), *(spread[p] for p in PAIRS)]
+            rows.append([t.session, t.name, *(f"{v:.9g}" for v in numbers)])
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for n, t in enumerate(parts):
-            for h in range(len(horizons)):
-                place, spread = flown.position[:, 1 + h, 0, n], covariance[n, h]
-                numbers = [t.time[0] + ahead[h, n], *place, *np.sqrt(np.diag(spread)), *(spread[p] for p in PAIRS)]
-                writer.writerow([t.session, t.name, *(f"{v:.9g}" for v in numbers)])
+    run_dir.write_csv(path, COLUMNS, rows)
     return [*record.lines(), f"{path}: {len(parts)} strokes; noise {1e3 * fitted.noise:.1f} mm"]

@@ -18,7 +18,6 @@ from experiments.sparse_reward import mean_reward
 from experiments.stats import wilson
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import COLUMNS, Evaluator
-from mjx_tt.env.policy import Policy
 from mjx_tt.env.reward_weights import TERMS
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.sim import randomisation
@@ -67,9 +66,10 @@ def evaluate(
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
-    reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound. stage:
-    shows what is being done. devices: this process' own by default, or all of several processes, each of which calls
-    this. unknown_balls: on how many to play in worlds drawn from the prior as well.
+    reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach, the balls known and
+    without noise; None: no bound. stage: shows what is being done. devices: this process' own by default, or all of
+    several processes, each of which calls this. unknown_balls: on how many to play as well, each in a world of its own
+    that is drawn from the prior.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
@@ -95,32 +95,16 @@ def evaluate(
     reachable = None
     if reachable_balls is not None:
         with stage(f"finding what is in reach of {reachable_balls} of them"):
-            reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
-    unknown = None
-    if unknown_balls is not None:
-        unknown = _unknown(experiment, trained, unknown_balls, seed, stage, devices)
+            model = experiment.model.model
+            r = reachability.reachable(simulator, balls, model, key, reachable_balls, trained.policy)
+            low, high = wilson(r.returned, r.balls)
+            reachable = {"return_rate": r.rate, "low": low, "high": high, "balls": r.balls, "by_policy": r.by_policy}
+    unknown, drawn = None, None if unknown_balls is None else build.unknown_worlds(experiment)
+    if unknown_balls is not None and drawn is not None:  # there is none for another robot
+        report = evaluate(drawn, trained, unknown_balls, seed, stage=stage, devices=devices).report
+        unknown = {name: report[name] for name in ("return_rate", "low", "high", "episodes")}
     found = {"reachable": reachable, "unknown_worlds": unknown}
     return Played(summary(result, task.terms) | found | conditions, result, incoming)
-
-
-def _unknown(
-    experiment: Experiment, trained: TrainedPolicy, balls: int, seed: int, stage: Stage, devices: int | None
-) -> dict[str, Any] | None:
-    """Return rate where every ball meets a world of its own, drawn from the prior; None for another robot."""
-    drawn = build.unknown_worlds(experiment)
-    if drawn is None:
-        return None
-    report = evaluate(drawn, trained, balls, seed, stage=stage, devices=devices).report
-    return {name: report[name] for name in ("return_rate", "low", "high", "episodes")}
-
-
-def _reachable(
-    experiment: Experiment, simulator: Simulator, balls: BallPool, key: jax.Array, count: int, policy: Policy
-) -> dict[str, Any]:
-    """Return rate of the policy or of motions optimised ball by ball, the balls known and without noise."""
-    found = reachability.reachable(simulator, balls, experiment.model.model, key, count, policy)
-    low, high = wilson(found.returned, found.balls)
-    return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
 
 
 def summary(result: RolloutResult, terms: tuple[str, ...] = TERMS) -> dict[str, Any]:

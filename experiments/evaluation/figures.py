@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import RcParams
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ballmodel import constants as c
@@ -37,17 +38,20 @@ STYLE = RcParams(
 
 def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...], contract: Contract = PAPER) -> list[Path]:
     """Writes landing map, return rate by incoming ball, rewards and joint speeds; ``weights`` of the eleven terms."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE):
-        return [
-            save(folder / "landing_map.png", _landing_map(played)),
-            save(folder / "return_rate_map.png", _return_rate_map(played)),
-            save(folder / "rewards.png", _rewards(played.report["terms"], weights)),
-            save(folder / "joint_speeds.png", _joint_speeds(played, contract)),
-        ]
+    parts: dict[str, Callable[[], None]] = {
+        "landing_map": lambda: _landing_map(played),
+        "return_rate_map": lambda: _return_rate_map(played),
+        "rewards": lambda: _rewards(played.report["terms"], weights),
+        "joint_speeds": lambda: _joint_speeds(played, contract),
+    }
+    paths = [folder / f"{name}.png" for name in parts]
+    for path, draw in zip(paths, parts.values(), strict=True):
+        with drawing(path):
+            draw()
+    return paths
 
 
-def _landing_map(played: Played) -> Figure:
+def _landing_map(played: Played) -> None:
     result, report = played.result, played.report
     figure, axes = plt.subplots(figsize=(5.4, 7.0))
     _table(axes)
@@ -61,10 +65,9 @@ def _landing_map(played: Played) -> Figure:
     axes.set_ylim(*LANDING_FRAME[1])
     axes.set_title(f"Where {report['episodes']:,} balls come down\n{_rate(report)}")
     figure.legend(loc="outside lower left", markerscale=2, title="dots on the frame lie beyond it", alignment="left")
-    return figure
 
 
-def _return_rate_map(played: Played) -> Figure:
+def _return_rate_map(played: Played) -> None:
     result, (x, y) = played.result, played.incoming.reshape(2, -1)
     returned = ((result.outcome == RETURNED) & result.finite).ravel()
     edges = np.linspace(-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2, 13), np.linspace(-c.TABLE_LENGTH / 2, 0, 12)
@@ -82,10 +85,9 @@ def _return_rate_map(played: Played) -> Figure:
     axes.set_xlim(-0.95, 0.95)
     axes.set_ylim(-1.5, 0.15)
     axes.set_title(f"Return rate [%] by where the incoming ball bounces\ncells with at least {FEWEST_BALLS} balls")
-    return figure
 
 
-def _rewards(terms: dict[str, float | None], weights: tuple[float, ...]) -> Figure:
+def _rewards(terms: dict[str, float | None], weights: tuple[float, ...]) -> None:
     names = list(terms)
     values = np.array([np.nan if terms[name] is None else terms[name] for name in names])
     weighted = values * np.array(weights)
@@ -101,10 +103,9 @@ def _rewards(terms: dict[str, float | None], weights: tuple[float, ...]) -> Figu
     axes.margins(x=0.15)
     axes.set_xlabel("mean reward per episode, times its weight")
     axes.set_title(f"Rewards by term, together {np.nansum(weighted):.2f}")
-    return figure
 
 
-def _joint_speeds(played: Played, contract: Contract) -> Figure:
+def _joint_speeds(played: Played, contract: Contract) -> None:
     peaks = played.result.peak_velocity[:, played.result.finite]
     columns = -(-contract.n_joints // 2)
     figure, grid = plt.subplots(2, columns, figsize=(2.625 * columns, 4.6), sharey=True, squeeze=False)
@@ -128,7 +129,6 @@ def _joint_speeds(played: Played, contract: Contract) -> Figure:
     figure.suptitle(
         "Highest commanded speed of each episode (red: the joint's limit)", x=0.01, ha="left", fontweight="bold"
     )
-    return figure
 
 
 def _table(axes: Axes) -> None:
@@ -147,9 +147,12 @@ def _rate(report: dict[str, Any]) -> str:
     return f"{report['return_rate']:.1%} returned (95 % interval {report['low']:.1%} to {report['high']:.1%})"
 
 
-def save(path: Path, figure: Figure) -> Path:
-    """Writes a figure as PNG and closes it."""
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
-    plt.close(figure)
-    return path
+@contextmanager
+def drawing(path: Path) -> Iterator[None]:
+    """Writes the figure that is drawn inside, by ``plt``, as PNG, and closes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with plt.rc_context(STYLE):
+        yield
+        with replacing(path) as temporary:
+            plt.savefig(temporary, format="png")
+        plt.close()

@@ -27,6 +27,7 @@ from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
 from mjx_tt.viz import html
 
+SEED = 0
 TREES = 300
 FOLDS = 5
 FAR = 0.99  # share of held-out strokes that are no farther from the known ones
@@ -51,17 +52,17 @@ class Likeness:
         return f"AUC {self.auc:.3f} ({self.low:.3f} to {self.high:.3f}), {self.far:.1%} unlike every stroke"
 
 
-def likeness(balls: np.ndarray, held_out: np.ndarray, known: np.ndarray, seed: int = 0) -> Likeness:
+def likeness(balls: np.ndarray, held_out: np.ndarray, known: np.ndarray) -> Likeness:
     """Likeness of a model's balls to held-out strokes, beside the strokes that the model was fitted to.
 
     Rows (n, 6) or (n, 9) are start states (``start_states``) or their first columns; at most as many
     balls as held-out strokes are used.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     balls = balls[: len(held_out)]
     rows, label = np.concatenate([balls, held_out]), np.repeat([1, 0], [len(balls), len(held_out)])
-    folds = StratifiedKFold(FOLDS, shuffle=True, random_state=seed)
-    forest = RandomForestClassifier(TREES, min_samples_leaf=3, random_state=seed)
+    folds = StratifiedKFold(FOLDS, shuffle=True, random_state=SEED)
+    forest = RandomForestClassifier(TREES, min_samples_leaf=3, random_state=SEED)
     chance = cross_val_predict(forest, rows, label, cv=folds, method="predict_proba")[:, 1]
     draws = []
     for _ in range(DRAWS):
@@ -76,18 +77,18 @@ def likeness(balls: np.ndarray, held_out: np.ndarray, known: np.ndarray, seed: i
     return Likeness(float(roc_auc_score(label, chance)), float(low), float(high), far)
 
 
-def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture: Path, seed: int = 0) -> list[str]:
+def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture: Path) -> list[str]:
     """Lines that compare balls of a mixture, and of the box, with strokes (3, n) that neither was fitted to.
 
     The mixture is fitted once more without the held-out quarter; the box is the one of all strokes. Draws both.
     """
     rows = start_states(landed)
-    order = np.random.default_rng(seed).permutation(len(rows))
+    order = np.random.default_rng(SEED).permutation(len(rows))
     count = min(HELD_OUT, len(rows) // 4)
     count = count if count >= FEWEST else 0
     held, known = rows[order[:count]], rows[order[count:]]
-    mixture = replace(fit_mixture(_state(known), seed=seed)[0], short_balls=box.short_balls)
-    keys = jax.random.split(jax.random.key(seed))
+    mixture = replace(fit_mixture(BallState(*np.split(known.T, 3)), seed=SEED)[0], short_balls=box.short_balls)
+    keys = jax.random.split(jax.random.key(SEED))
     drawn = {
         name: start_states(sample_pool(key, balls, ball, max(count, DRAWN)).state)
         for name, balls, key in (("mixture", mixture, keys[0]), ("box", box, keys[1]))
@@ -98,15 +99,11 @@ def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture:
         return [*lines, f"{len(rows)} strokes are too few to hold out a quarter and compare, {4 * FEWEST} are wanted"]
     for title, columns in (("position and velocity", 6), ("spin as well", 9)):
         for name, balls in drawn.items():
-            found = likeness(balls[:, :columns], held[:, :columns], known[:, :columns], seed)
+            found = likeness(balls[:, :columns], held[:, :columns], known[:, :columns])
             lines.append(f"{name} against {count:,} held-out strokes, {title}: {found}")
         if not np.any(rows[:, 6:]):
             break
     return lines
-
-
-def _state(rows: np.ndarray) -> BallState:
-    return BallState(rows[:, :3].T, rows[:, 3:6].T, rows[:, 6:].T)
 
 
 def _draw(rows: np.ndarray, drawn: dict[str, np.ndarray], path: Path) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import RunError
+from experiments.runs import lines
 from robot_io.control.episode import EpisodeSummary
 
 BEFORE, TRAINING, AFTER = "before", "training", "after"
@@ -70,30 +69,17 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: list[Entry] = []
+        self._lines, self._sealed = 0, False  # lines so far, and whether they have checksums
         self._digest = hashlib.sha256()  # of all lines
-        whole = self._read() if path.exists() else 0
-        self._file = open(path, "ab", buffering=0)
-        os.ftruncate(self._file.fileno(), whole)
-        os.fsync(self._file.fileno())
-        sync_folder(path.parent)
+        lines.read(path, self._take_line, "episode")
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
-        line = content = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
-        handle = self._file.fileno()
-        start = os.fstat(handle).st_size
-        try:
-            while line:
-                line = line[os.write(handle, line) :]
-            os.fsync(handle)
-        except OSError:
-            os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
-            raise
-        self._digest.update(content)
+        line = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
+        lines.append(self.path, line)
+        self._lines += 1
+        self._digest.update(line)
         self._take(entry)
-
-    def close(self) -> None:
-        self._file.close()
 
     def _take(self, entry: Entry) -> None:
         """A line about the episode before, which was discarded late, stands in its place."""
@@ -107,41 +93,21 @@ class Journal:
         digest.update(content)
         return content[:-1] + f', "checksum": "{digest.hexdigest()[:16]}"}}\n'.encode()
 
-    def _read(self) -> int:
-        """Reads the entries; length [bytes] of the whole lines."""
-        content, whole = self.path.read_bytes(), 0
-        lines, checked = content.splitlines(keepends=True), False
-        for i, line in enumerate(lines):
-            try:
-                if not line.endswith(b"\n"):
-                    raise ValueError("the line has no end")
-                checked |= _CHECKSUM.search(line) is not None
-                if checked and line != self._checked(_CHECKSUM.sub(b"}", line)):
-                    raise RunError(
-                        f"{self.path}: line {i + 1} was changed, or lines before it were changed, doubled or taken "
-                        "out; restore the file or start a new run"
-                    )
-                self._take(_from_json(json.loads(line)))
-            except (ValueError, TypeError, KeyError) as error:
-                if i == len(lines) - 1:
-                    break
-                raise RunError(
-                    f"{self.path}: line {i + 1} is no episode ({error}); restore the file or start a new run"
-                ) from None
-            self._digest.update(line)
-            whole += len(line)
-        return whole
+    def _take_line(self, line: bytes) -> None:
+        self._sealed |= _CHECKSUM.search(line) is not None
+        if self._sealed and line != self._checked(_CHECKSUM.sub(b"}", line)):
+            raise RunError(
+                f"{self.path}: line {self._lines + 1} was changed, or lines before it were changed, doubled or taken "
+                "out; restore the file or start a new run"
+            )
+        self._take(_from_json(json.loads(line)))
+        self._lines += 1
+        self._digest.update(line)
 
 
 def _to_json(entry: Entry) -> dict[str, Any]:
-    shown = {name: getattr(entry, name) for name in ("phase", "update", "member", "repeat", "episode")}
-    return shown | {
-        "summary": asdict(entry.summary),
-        "terms": entry.terms,
-        "return": entry.returns,
-        "discarded": entry.discarded,
-        "trajectory": [[float(v) for v in sample] for sample in entry.trajectory],
-    }
+    data = asdict(entry) | {"trajectory": entry.trajectory.tolist()}
+    return {"return" if name == "returns" else name: value for name, value in data.items()}
 
 
 def _from_json(data: dict[str, Any]) -> Entry:

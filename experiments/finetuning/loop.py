@@ -11,6 +11,7 @@ import hashlib
 import math
 import os
 import time
+from contextlib import closing
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -32,8 +33,7 @@ from experiments.config.finetuning import FineTuning
 from experiments.errors import RunError
 from experiments.finetuning import report
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
-from experiments.finetuning.progress import FineTuningProgress
-from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall, Robot, throws_of
+from experiments.finetuning.robot import LockStepRobot, Operator, Robot
 from experiments.progress import print_files
 from experiments.runs import checkpoint, load_policy, metrics, run_dir
 from experiments.runs.metrics import MetricsLog
@@ -47,6 +47,7 @@ from mjx_tt.env.terms import PlayedBall as RewardedBall
 from robot_io.contract import JOINT_NAMES
 from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.opponent import Throws
 from robot_io.policy import jax_policy
 from robot_io.policy.policy import Policy
 
@@ -88,17 +89,8 @@ def finetune(
     with run.locked():
         _open(run, experiment, settings, robot, first, str(source))
         tuning = FineTuningRun(settings, run, robot, operator or Operator(), console, first, network)
-        try:
+        with closing(tuning.log), run_dir.continuable(run.folder, "every episode before", "it"):
             finished = tuning.run()
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
-                "is kept. Make room or repair the folder, then run the same command again to continue"
-            ) from error
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
-        finally:
-            tuning.close()
         if not finished:
             console.print(f"{run.folder}: stopped; the same command continues it")
             return None
@@ -118,7 +110,8 @@ def lock_step_robot(experiment: Experiment, params: RigParams | None = None, see
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
     pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
     robot = experiment.task.robot
-    return LockStepRobot(throws_of(pool.state), params, robot.scene(), robot.contract)
+    throws = Throws(*(np.asarray(part, float) for part in (pool.state.position, pool.state.velocity, pool.state.spin)))
+    return LockStepRobot(throws, params, robot.scene(), robot.contract)
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
@@ -151,6 +144,7 @@ class FineTuningRun:
 
     journal  every episode so far
     state    after ``update`` updates
+    log      of the measurements, to be closed
     """
 
     def __init__(
@@ -161,9 +155,9 @@ class FineTuningRun:
         operator: Operator,
         console: Console,
         first: TrainState,
-        network: Network | None = None,
+        network: Network,
     ) -> None:
-        self._network = None if network is None else jax_policy.exported(network)
+        self._network = jax_policy.exported(network)
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
         self._weights = {term.name: term.weight for term in build.reward_terms(settings.rewards)}
@@ -176,28 +170,24 @@ class FineTuningRun:
             raise RunError(
                 f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit"
             )
-        self._log = MetricsLog(run.metrics, run.tensorboard, self.update)
+        self.log = MetricsLog(run.metrics, run.tensorboard, self.update)
         planned = 2 * settings.evaluation_balls + settings.updates * settings.episodes_per_update
-        self._progress = FineTuningProgress(console, str(run.folder), planned, settings)
+        self._progress = report.FineTuningProgress(console, str(run.folder), planned, settings)
         self._moment = time.monotonic()
-
-    def close(self) -> None:
-        self.journal.close()
-        self._log.close()
 
     def run(self) -> bool:
         """Plays what is still to be played; False when the operator stopped it."""
         with self._progress as progress:
             progress.resumed(len(self._played), len(self.journal.entries))
-            if self._evaluate(BEFORE) is None:
+            if not self._evaluate(BEFORE):
                 return False
             while self.update < self._settings.updates:
                 if not self._advance():
                     return False
-            return self._evaluate(AFTER) is not None
+            return self._evaluate(AFTER)
 
-    def _evaluate(self, phase: str) -> list[Entry] | None:
-        """Episodes of the unperturbed policy."""
+    def _evaluate(self, phase: str) -> bool:
+        """Episodes of the unperturbed policy; False when the operator stopped it."""
         played_before = phase == BEFORE and self.update > 0  # before the first update: only read
         theta = None if played_before else np.asarray(self.state.bgs.average)
         update = 0 if phase == BEFORE else self.update
@@ -205,11 +195,11 @@ class FineTuningRun:
         entries = self._play_all(dict.fromkeys(slots, theta))
         if entries is not None:
             self._progress.note(f"{phase} fine-tuning: {report.sentence(report.evaluated(entries))}")
-        return entries
+        return entries is not None
 
     def _advance(self) -> bool:
         """One update; False when the operator stopped it."""
-        settings, number = self._settings, self.update + 1
+        settings, number, pairs = self._settings, self.update + 1, self._settings.num_directions
         population = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
         members = np.asarray(population.members)
         # The members take turns, so that a person who tires or warms up is the same to both of a pair.
@@ -217,12 +207,13 @@ class FineTuningRun:
             {
                 (TRAINING, number, member, repeat): members[:, member]
                 for repeat in range(settings.repeats)
-                for member in _order(settings.num_directions)
+                for pair in range(pairs)
+                for member in (pair, pairs + pair)
             }
         )
         if entries is None:
             return False
-        returns = np.zeros(2 * settings.num_directions)
+        returns = np.zeros(2 * pairs)
         for entry in entries:
             returns[entry.member] += entry.returns / settings.repeats
         bgs, info = strategy.tell(self.state.bgs, population, jnp.asarray(returns, jnp.float32), self._bgs)
@@ -234,8 +225,8 @@ class FineTuningRun:
         self._seconds, self._moment = self._seconds + now - self._moment, now
         row = {"update": number, "seconds": round(self._seconds, 3)} | report.update_row(entries)
         row |= {name: float(getattr(info, name)) for name in ("gradient_norm", "update_norm", "elite_std")}
-        self._log.write([row])
-        self._log.sync()
+        self.log.write([row])
+        self.log.sync()
         checkpoint.save(self._run.checkpoints, number, self.state, {"seconds": self._seconds})
         self._progress.updated(number, row)
         return True
@@ -275,32 +266,28 @@ class FineTuningRun:
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
                     "are done; restore the file or start a new run"
                 )
-            number = self._next_number(*slot[:2])
+            # A ball that is played again is another one: every attempt counts. The balls of the evaluations before and
+            # after are the same, where the robot can.
+            phase, update = slot[:2]
+            if phase == TRAINING:
+                number = sum(entry.phase == TRAINING for entry in self.journal.entries)
+            else:
+                attempts = sum(entry.slot[:2] == (phase, update) for entry in self.journal.entries)
+                number = EVALUATION_EPISODES + attempts
             # As float32 numbers they are those of the exported policy.
             mean, inv_std = (np.asarray(a) for a in normalizer.normaliser(self.state.statistics))
             played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
             if self._operator.retracts():
                 self._retract(slot)
-            entry = self._entry(slot, number, played)
+            summary, terms = played.summary, reward_terms(played.summary)
+            returns = sum(self._weights[name] * value for name, value in terms.items())
+            discarded = self._operator.discarded() or summary.unfit  # asked in any case: it is about this ball
+            entry = Entry(*slot, number, summary, terms, returns, discarded, played.trajectory)
             self.journal.append(entry)
             if not entry.discarded:
                 self._played[slot] = entry
             self._progress.played(entry)
         return True
-
-    def _next_number(self, phase: str, update: int) -> int:
-        """A ball that is played again is another one: every attempt counts."""
-        if phase == TRAINING:
-            return sum(entry.phase == TRAINING for entry in self.journal.entries)
-        attempts = sum(entry.phase == phase and entry.update == update for entry in self.journal.entries)
-        return EVALUATION_EPISODES + attempts  # the same balls before and after, where the robot can
-
-    def _entry(self, slot: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
-        summary = played.summary
-        terms = reward_terms(summary)
-        returns = sum(self._weights[name] * value for name, value in terms.items())
-        discarded = self._operator.discarded() or summary.unfit  # asked in any case: the question is about this ball
-        return Entry(*slot, number, summary, terms, returns, discarded, played.trajectory)
 
 
 def conclude(
@@ -328,25 +315,29 @@ def conclude(
     return result
 
 
-def _order(pairs: int) -> list[int]:
-    """Members in the order of play: both of a pair, one after the other."""
-    return [member for pair in range(pairs) for member in (pair, pairs + pair)]
-
-
 def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str) -> None:
     """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
 
     Before the first ball there is nothing to protect: a failed start must not stand in the way of the corrected one.
     """
     path, journal = run.folder / SETTINGS, run.folder / JOURNAL
+    arrays = (first.bgs.theta, *normalizer.normaliser(first.statistics))
     wanted = {
         "source": source,
-        "policy": _digest(first),
+        "policy": hashlib.sha256(b"".join(np.asarray(a, np.float32).tobytes() for a in arrays)).hexdigest(),
         "robot": robot.describe(),
         "settings": settings.model_dump(mode="json"),
     }
     if path.exists() and journal.exists() and journal.stat().st_size > 0:
-        _check(run.folder, read_yaml(path.read_text(encoding="utf-8"), str(path)), wanted, settings)
+        found = read_yaml(path.read_text(encoding="utf-8"), str(path))
+        # A run that an earlier version began has the defaults of keys that came later.
+        found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
+        longer = {"settings.updates"} if settings.step.schedule.kind == "constant" else set()
+        changeable = longer | {"source"}  # the policy itself is compared
+        if changed := run_dir.differences(found, wanted, changeable.__contains__):
+            raise RunError(
+                f"{run.folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out"
+            )
     elif not path.exists() and (run.folder / CONFIG).exists():
         raise RunError(f"{run.folder}: is a run of another kind; choose another --out")
     config = experiment.config.model_copy(
@@ -357,20 +348,3 @@ def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, 
             yaml.safe_dump(data, file, sort_keys=False)
             file.flush()
             os.fsync(file.fileno())
-
-
-def _check(folder: Path, found: dict[str, Any], wanted: dict[str, Any], settings: FineTuning) -> None:
-    # A run that an earlier version began has the defaults of keys that came later.
-    found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
-    changeable = {"source"}  # the policy itself is compared
-    if settings.step.schedule.kind == "constant":
-        changeable.add("settings.updates")
-    changed = run_dir.differences(found, wanted, changeable.__contains__)
-    if changed:
-        raise RunError(f"{folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out")
-
-
-def _digest(state: TrainState) -> str:
-    """SHA-256 of parameters and normaliser."""
-    arrays = (state.bgs.theta, *normalizer.normaliser(state.statistics))
-    return hashlib.sha256(b"".join(np.asarray(a, np.float32).tobytes() for a in arrays)).hexdigest()

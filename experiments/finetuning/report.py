@@ -1,22 +1,24 @@
-"""Measurements of a fine-tuning: rows of metrics, the evaluation before and after, the curve, the human's balls."""
+"""A fine-tuning in numbers: its progress, rows of metrics, the evaluation before and after, the curve, the balls."""
 
 from __future__ import annotations
 
-import csv
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
+import pandas
 from rich.console import Console
 from rich.table import Table
 
-from ballmodel.io.atomic_files import replacing
 from ballmodel.io.tables import COLUMNS
-from experiments.evaluation.figures import HIT_COLOUR, MISSED_COLOUR, RETURNED_COLOUR, STYLE, save
+from experiments.config.finetuning import FineTuning
+from experiments.evaluation.figures import HIT_COLOUR, MISSED_COLOUR, RETURNED_COLOUR, drawing
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
+from experiments.progress import ProgressBar, seconds_left
+from experiments.runs import run_dir
 from experiments.stats import t_interval, welch_interval, wilson
 from mjx_tt.viz.html import INK
 from robot_io.control.episode import HIT, RETURNED
@@ -28,31 +30,77 @@ RATES = (
     ("fault_rate", MISSED_COLOUR, "faults"),
 )
 SMOOTHING = 7  # updates
+NAMES = {BEFORE: "evaluation before", AFTER: "evaluation after"}
 SHORTEST = 2  # samples of a ball that is worth keeping
+
+
+class FineTuningProgress(ProgressBar):
+    """Counts balls. The remaining time is that of the balls still to play at the rate of this session."""
+
+    def __init__(self, console: Console, name: str, planned: int, settings: FineTuning) -> None:
+        super().__init__(console, name, planned, unit=" balls")
+        self._updates = settings.updates
+        self._counted = self._played = 0
+        self._rate: float | None = None  # [s] per ball
+        self._moment = time.monotonic()
+        self._update_text = ""
+        self._pausing = False
+
+    def resumed(self, kept: int, attempts: int) -> None:
+        """At the start: how many episodes are there already, and how many with the discarded ones."""
+        self._counted, self._moment = kept, time.monotonic()
+        if attempts:
+            self.note(f"continues after {attempts:,} balls, {attempts - kept:,} of them discarded")
+
+    def paused(self) -> None:
+        if not self._pausing:
+            self._pausing = True
+            self.show(self._counted, "paused", plain=True)
+        self._moment = time.monotonic()  # waiting says nothing of the rate
+
+    def played(self, entry: Entry) -> None:
+        """After every episode, discarded or not."""
+        now = time.monotonic()
+        self._pausing = False
+        self._counted += not entry.discarded
+        self._played += 1
+        seconds, self._moment = now - self._moment, now
+        self._rate = seconds if self._rate is None else self._rate + (seconds - self._rate) / min(self._played, 50)
+        where = NAMES.get(entry.phase) or f"update {entry.update}/{self._updates}"
+        outcome = f"fault: {entry.summary.fault}" if entry.summary.fault else entry.summary.outcome
+        outcome = "discarded" if entry.discarded else outcome
+        self.show(self._counted, f"{where}  {outcome}{self._update_text}  {self._left()} left", plain=False)
+
+    def retracted(self) -> None:
+        """After a ball that counted was discarded."""
+        self._counted -= 1
+        self.note("the ball before was discarded: it is played again")
+
+    def updated(self, update: int, row: dict[str, Any]) -> None:
+        """After every update with its row of measurements."""
+        self._update_text = f"  mean return {row['mean_return']:.2f}, returned {row['return_rate']:.0%}"
+        text = f"update {update}/{self._updates}{self._update_text}  {self._left()} left"
+        self.show(self._counted, text, plain=True)
+
+    def _left(self) -> str:
+        return str(seconds_left((self._total - self._counted) * (self._rate or 0.0)))
 
 
 def update_row(entries: list[Entry]) -> dict[str, float]:
     """One update's measurements of its perturbed policies; low, high: 95 % interval of the mean return."""
-    row = _rates(entries)
-    mean, low, high = t_interval([entry.returns for entry in entries])
-    terms = {f"reward/{name}": float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms}
-    return {"mean_return": mean, "low": low, "high": high} | row | terms
+    return _measured(entries) | {f"reward/{name}": value for name, value in _terms(entries).items()}
 
 
 def evaluated(entries: list[Entry]) -> dict[str, Any]:
     """One evaluation: the mean return with its 95 % interval, the rates, the terms."""
-    mean, low, high = t_interval([entry.returns for entry in entries])
-    rates = _rates(entries)
-    returned = wilson(round(rates["return_rate"] * len(entries)), len(entries))
+    measured = _measured(entries)
+    low, high = wilson(round(measured["return_rate"] * len(entries)), len(entries))
     return {
         "balls": len(entries),
-        "mean_return": mean,
-        "low": low,
-        "high": high,
-        **rates,
-        "return_rate_low": returned[0],
-        "return_rate_high": returned[1],
-        "terms": {name: float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms},
+        **measured,
+        "return_rate_low": low,
+        "return_rate_high": high,
+        "terms": _terms(entries),
         "faults": dict(Counter(entry.summary.fault for entry in entries if entry.summary.fault)),
     }
 
@@ -125,17 +173,10 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
 
 def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
     """Writes the measured balls as CSV (docs/reference/measured-balls.md); returns their number."""
-    count = 0
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for entry in entries:
-            if len(entry.trajectory) < SHORTEST:
-                continue
-            count += 1
-            name = f"{entry.phase}{entry.episode}"
-            writer.writerows((session, name, *map(repr, sample)) for sample in entry.trajectory.tolist())
-    return count
+    kept = [entry for entry in entries if len(entry.trajectory) >= SHORTEST]
+    rows = ((session, f"{e.phase}{e.episode}", *map(repr, sample)) for e in kept for sample in e.trajectory.tolist())
+    run_dir.write_csv(path, COLUMNS, rows)
+    return len(kept)
 
 
 def draw(path: Path, rows: list[dict[str, Any]], balls: int, result: dict[str, Any], title: str) -> Path:
@@ -143,62 +184,60 @@ def draw(path: Path, rows: list[dict[str, Any]], balls: int, result: dict[str, A
 
     rows: of metrics.jsonl; balls: of an update.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE):
-        return save(path, _figure(rows, balls, result, title))
+    with drawing(path):
+        figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1))
+        column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        if rows:
+            updates, mean = column["update"], column["mean_return"]
+            style: Any = {"color": CURVE_COLOUR}
+            upper.fill_between(updates, column["low"], column["high"], alpha=0.18, linewidth=0, **style)
+            label = f"perturbed policies, {balls} balls an update, 95 %"
+            upper.plot(updates, mean, "o", markersize=3, alpha=0.7, label=label, **style)
+            upper.plot(updates, _smooth(mean), linewidth=1.8, label=f"mean over {SMOOTHING} updates", **style)
+            for name, colour, label in RATES:
+                lower.plot(updates, _smooth(column[name]), color=colour, label=label, linewidth=1.5)
+        ends = (0, result["updates"] + 1)
+        for at, name in zip(ends, (BEFORE, AFTER), strict=True):
+            e = result[name]
+            bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
+            legend = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None
+            style = {"fmt": "D", "color": INK, "markersize": 5, "capsize": 3, "zorder": 4}
+            upper.errorbar(at, e["mean_return"], bars, label=legend, **style)
+        upper.axhline(result["before"]["mean_return"], color=INK, linewidth=0.8, linestyle=":", zorder=1)
+        upper.set_ylabel("mean return")
+        before, after, d = (result[name] for name in ("before", "after", "difference"))
+        change = f"{d['mean_return']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f})"
+        upper.set_title(f"{title}\nmean return {before['mean_return']:.2f} to {after['mean_return']:.2f}: {change}")
+        lower.set_ylim(-0.02, 1.02)
+        lower.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
+        lower.set_ylabel(f"balls, mean of {SMOOTHING}")
+        lower.set_xlabel("update")
+        lines = [pair for axes in (upper, lower) for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+        if lines:
+            figure.legend(*zip(*lines, strict=True), loc="outside lower left", fontsize=9, ncols=2)
+        for axes in (upper, lower):
+            axes.grid(axis="y", alpha=0.25)
+    return path
 
 
-def _figure(rows: list[dict[str, Any]], balls: int, result: dict[str, Any], title: str) -> Figure:
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1))
-    column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-    if rows:
-        updates, mean = column["update"], column["mean_return"]
-        style: Any = {"color": CURVE_COLOUR}
-        upper.fill_between(updates, column["low"], column["high"], alpha=0.18, linewidth=0, **style)
-        label = f"perturbed policies, {balls} balls an update, 95 %"
-        upper.plot(updates, mean, "o", markersize=3, alpha=0.7, label=label, **style)
-        upper.plot(updates, smooth(mean), linewidth=1.8, label=f"mean over {SMOOTHING} updates", **style)
-        for name, colour, label in RATES:
-            lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
-    ends = (0, result["updates"] + 1)
-    for at, name in zip(ends, (BEFORE, AFTER), strict=True):
-        e = result[name]
-        bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
-        legend = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None
-        upper.errorbar(at, e["mean_return"], bars, fmt="D", color=INK, markersize=5, capsize=3, label=legend, zorder=4)
-    upper.axhline(result["before"]["mean_return"], color=INK, linewidth=0.8, linestyle=":", zorder=1)
-    upper.set_ylabel("mean return")
-    upper.set_title(f"{title}\n{_headline(result)}")
-    lower.set_ylim(-0.02, 1.02)
-    lower.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
-    lower.set_ylabel(f"balls, mean of {SMOOTHING}")
-    lower.set_xlabel("update")
-    lines = [pair for axes in (upper, lower) for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    if lines:
-        figure.legend(*zip(*lines, strict=True), loc="outside lower left", fontsize=9, ncols=2)
-    for axes in (upper, lower):
-        axes.grid(axis="y", alpha=0.25)
-    return figure
-
-
-def smooth(values: np.ndarray) -> np.ndarray:
-    """Mean over the SMOOTHING updates around each; fewer at the ends."""
-    half = SMOOTHING // 2
-    return np.array([values[max(0, i - half) : i + half + 1].mean() for i in range(len(values))])
-
-
-def _headline(result: dict[str, Any]) -> str:
-    before, after, d = (result[name] for name in ("before", "after", "difference"))
-    return (
-        f"mean return {before['mean_return']:.2f} to {after['mean_return']:.2f}: "
-        f"{d['mean_return']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f})"
-    )
-
-
-def _rates(entries: list[Entry]) -> dict[str, float]:
+def _measured(entries: list[Entry]) -> dict[str, float]:
+    """Mean return with its 95 % interval, and rates."""
+    mean, low, high = t_interval([entry.returns for entry in entries])
     outcomes = [entry.summary.outcome for entry in entries]
     return {
+        "mean_return": mean,
+        "low": low,
+        "high": high,
         "return_rate": outcomes.count(RETURNED) / len(outcomes),
         "hit_rate": (outcomes.count(RETURNED) + outcomes.count(HIT)) / len(outcomes),
         "fault_rate": sum(entry.summary.fault is not None for entry in entries) / len(entries),
     }
+
+
+def _terms(entries: list[Entry]) -> dict[str, float]:
+    return {name: float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms}
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Mean over the SMOOTHING updates around each; fewer at the ends."""
+    return pandas.Series(values).rolling(SMOOTHING, min_periods=1, center=True).mean().to_numpy()

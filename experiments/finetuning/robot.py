@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 import mjx_tt
-from ballmodel.state import BallState
 from experiments.errors import RunError
 from robot_io.contract import PAPER, Contract
 from robot_io.control.bridge import BridgeState
@@ -82,7 +82,21 @@ class Operator:
         return False
 
 
-class LockStepRobot:
+class _Emulated:
+    """The emulated robot in this process; contract: of the robot in ``scene``."""
+
+    def __init__(self, params: RigParams | None, scene: str | Path, contract: Contract) -> None:
+        self._params, self._scene, self._contract = params or RigParams(), scene, contract
+
+    def _computed(self, policy: Policy) -> StepPolicy:
+        return make_policy("numpy" if policy.network is None else "jit", policy, self._contract)
+
+    def _described(self, name: str) -> dict[str, Any]:
+        other = {} if self._contract == PAPER else {"joints": self._contract.robot}
+        return {"robot": name, "params": repr(self._params)} | other
+
+
+class LockStepRobot(_Emulated):
     """The emulated robot in this process. Every episode begins with power-on, so that it depends on its number only.
 
     throws  the balls; episode n meets ball n, and ball n - size after the last
@@ -97,7 +111,8 @@ class LockStepRobot:
         scene: str | Path = SCENE,
         contract: Contract = PAPER,
     ) -> None:
-        self._throws, self._params, self._scene, self._contract = throws, params or RigParams(), scene, contract
+        super().__init__(params, scene, contract)
+        self._throws = throws
         self._world = World(scene, self._params.world, contract)
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
@@ -105,7 +120,7 @@ class LockStepRobot:
         rig = LockStep(
             self._scene,
             self._throws,
-            make_policy("numpy" if policy.network is None else "jit", policy, self._contract),
+            self._computed(policy),
             self._params,
             BridgeConfig(contract=self._contract),
             recorder=balls,
@@ -122,15 +137,14 @@ class LockStepRobot:
         return PlayedBall(found[0], balls.trajectory(found[0].ball))
 
     def describe(self) -> dict[str, Any]:
-        found = {"robot": "lock-step", "params": repr(self._params), "balls": int(self._throws.position.shape[1])}
-        return found | _named(self._contract)
+        return self._described("lock-step") | {"balls": int(self._throws.position.shape[1])}
 
 
-class LockStepRallies:
+class LockStepRallies(_Emulated):
     """The emulated robot in this process, in rallies with an opponent; one session, which is not repeated.
 
     It takes balls only while an episode is asked for, and credits only those that the policy of that episode played.
-    recorder: of the whole session; contract: of the robot in ``scene``
+    recorder: of the whole session
     """
 
     repeatable = False
@@ -143,7 +157,7 @@ class LockStepRallies:
         recorder: SessionRecorder | None = None,
         contract: Contract = PAPER,
     ) -> None:
-        self._params, self._contract = params or RigParams(), contract
+        super().__init__(params, scene, contract)
         config = BridgeConfig(contract=contract)
         self._made = partial(LockStep, scene, opponent, params=self._params, config=config, recorder=recorder)
         self._rig: LockStep | None = None
@@ -163,8 +177,13 @@ class LockStepRallies:
         rig, bridge = self._rig, self._rig.bridge
         self._version += 1
         end = rig.now + LONGEST_WAIT
-        rig.run(EXCHANGE)
-        self._exchange(policy)
+        exchanged = False
+        while not exchanged:  # as soon as the ball before is not played any more
+            rig.run(EXCHANGE)
+            with suppress(RefusedError):
+                bridge.set_policy(self._computed(policy), self._version)
+                exchanged = True
+        bridge.paused = False
         while rig.now < end:
             rig.run(0.1, lambda: bool(rig.summaries) or bridge.state in (BridgeState.FAULT, BridgeState.DISARMED))
             found = rig.summaries.popleft() if rig.summaries else None
@@ -176,27 +195,8 @@ class LockStepRallies:
                 return PlayedBall(found, rig.track)
         raise RunError(f"no ball was played for {LONGEST_WAIT:g} s: {[str(f) for f in bridge.gate.faults]}")
 
-    def _exchange(self, policy: Policy) -> None:
-        """Hand the policy over as soon as the ball before is not played any more."""
-        rig = self._rig
-        while rig is not None:
-            try:
-                rig.bridge.set_policy(self._computed(policy), self._version)
-                rig.bridge.paused = False
-                return
-            except RefusedError:
-                rig.run(EXCHANGE)
-
     def describe(self) -> dict[str, Any]:
-        return {"robot": "rallies in lock-step", "params": repr(self._params)} | _named(self._contract)
-
-    def _computed(self, policy: Policy) -> StepPolicy:
-        return make_policy("numpy" if policy.network is None else "jit", policy, self._contract)
-
-
-def _named(contract: Contract) -> dict[str, str]:
-    """Another robot than the paper's, for the description."""
-    return {} if contract == PAPER else {"joints": contract.robot}
+        return self._described("rallies in lock-step")
 
 
 class BallRecorder(NullRecorder):
@@ -220,8 +220,3 @@ class BallRecorder(NullRecorder):
         """Samples (n, 4) of the tracker's ball of that number: t [s], x, y, z [m], in the order of capture."""
         samples = sorted({sample[0]: sample for sample in self._samples.get(ball, [])}.values())
         return np.array(samples, float).reshape(-1, 4)
-
-
-def throws_of(state: BallState) -> Throws:
-    """Balls of a pool, ``BallState`` of arrays (3, n), for the rig's thrower."""
-    return Throws(*(np.asarray(part, float) for part in (state.position, state.velocity, state.spin)))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import hashlib
 import json
 import platform
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -151,6 +152,20 @@ class Run:
         return json.loads(self.evaluation.read_text())
 
 
+@contextmanager
+def continuable(folder: Path, kept: str, what: str) -> Iterator[None]:
+    """Says of a disk that refuses, and of a Ctrl-C, what is kept, and that the same command continues ``what``."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{error.filename or folder}: {error.strerror or error}; {kept} is kept. "
+            "Make room or repair the folder, then run the same command again to continue"
+        ) from error
+    except KeyboardInterrupt as stopped:
+        raise KeyboardInterrupt(f"{stopped}\n{folder}: stopped; the same command continues {what}".lstrip()) from None
+
+
 def training_ended(config: Config, update: int, seconds: float, return_rate: float | None) -> str | None:
     """The setting that ends training at this point, or None.
 
@@ -201,6 +216,12 @@ def write_yaml(path: Path, data: dict[str, Any]) -> None:
     """Replaces the file by YAML in the order given, whole or not at all. Raises OSError."""
     with replacing(path) as temporary:
         temporary.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+
+
+def write_csv(path: Path, head: Sequence[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Replaces the file by a table, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows((head, *rows))
 
 
 def _git(root: Path, *arguments: str) -> str | None:

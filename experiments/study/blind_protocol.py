@@ -18,7 +18,7 @@ import shutil
 import string
 import zlib
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -28,6 +28,7 @@ import numpy as np
 
 from ballmodel.io.atomic_files import replacing
 from experiments.errors import ConfigError, error_context
+from experiments.runs import run_dir
 from experiments.study.analysis import scoring
 from mjx_tt.rally.end_reasons import ROWS, End
 
@@ -62,13 +63,9 @@ def seal(path: Path, content: Any) -> str:
     """Writes plain JSON data so that it is not read by chance; returns the SHA-256 that commits to it."""
     plain = json.dumps({"nonce": secrets.token_hex(16), "content": content}).encode()
     digest = hashlib.sha256(plain).hexdigest()
-    sealed = {
-        "note": "Sealed: to be opened when all evaluations are done.",
-        "sha256": digest,
-        "sealed": base64.b64encode(zlib.compress(plain)).decode("ascii"),
-    }
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(sealed, indent=2) + "\n", encoding="utf-8")
+    note, content = "Sealed: to be opened when all evaluations are done.", base64.b64encode(zlib.compress(plain))
+    sealed = {"note": note, "sha256": digest, "sealed": content.decode("ascii")}
+    run_dir.write_json(path, sealed)
     return digest
 
 
@@ -124,34 +121,27 @@ def make(folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, 
     begun = folder / BEGUN
     if (folder / KEY).exists() or ((folder / POLICIES).exists() and not begun.exists()):
         raise ConfigError(f"{folder}: holds a blind evaluation already; choose another folder")
-    found = {}
+    loaded = {}
     for model, path in policies.items():
-        path = Path(path)
-        found[model] = path if (path / artefact.MANIFEST).exists() else path / "artefact"
-        if not (found[model] / artefact.MANIFEST).exists():
+        found = [place for place in (path, path / "artefact") if (place / artefact.MANIFEST).exists()]
+        if not found:
             raise ConfigError(
                 f"{model}: {path} is no artefact and no run with one; export it with `mjx-tt export {path}`"
             )
-    loaded = {model: artefact.load(path) for model, path in found.items()}
+        loaded[model] = artefact.load(found[0])
     key = draw(policies, np.random.default_rng())
     folder.mkdir(parents=True, exist_ok=True)
     if begun.exists():  # killed on the way: nobody has seen its codes
         shutil.rmtree(folder / POLICIES, ignore_errors=True)
     begun.touch()
     digests = {model: _copy(loaded[model], folder / POLICIES / code) for model, code in key.items()}
-    content = {
-        "codes": key,
-        "digests": digests,
-        "originals": {model: a.digest for model, a in loaded.items()},
-        "trainer": trainer,
-        "evaluator": evaluator,
-        "seed": seed,
-    }
-    write_blank_sheet(folder / SHEET, tuple(key.values()))
-    write_page(folder / PAGE, tuple(key.values()))
-    seal(folder / KEY, content)
+    originals, codes = {model: a.digest for model, a in loaded.items()}, tuple(key.values())
+    write_blank_sheet(folder / SHEET, codes)
+    write_page(folder / PAGE, codes)
+    who = {"trainer": trainer, "evaluator": evaluator, "seed": seed}
+    seal(folder / KEY, {"codes": key, "digests": digests, "originals": originals} | who)
     begun.unlink()
-    return tuple(key.values())
+    return codes
 
 
 def _copy(policy: Artefact, folder: Path) -> str:
@@ -282,11 +272,10 @@ def open_key(folder: Path) -> scoring.Rallies:
     for model, code in key["codes"].items():
         if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
             raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
-        rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code]), strict=True))
-        one = scoring.score_rallies(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
-        parts.append(replace(one, rally=rally))
+        rally, length, end = zip(*map(astuple, sheet[code]), strict=True)
+        who = (key["seed"], key["trainer"], key["evaluator"], model, code)
+        parts.append(scoring.score_rallies(*who, length, end, rally))
     rallies = scoring.join(parts)
     scoring.write(folder / EVALUATIONS, rallies)
-    with replacing(folder / OPENED) as temporary:
-        temporary.write_text(json.dumps(key, indent=2) + "\n", encoding="utf-8")
+    run_dir.write_json(folder / OPENED, key)
     return rallies

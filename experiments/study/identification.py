@@ -7,9 +7,7 @@ samples; what no log shows is drawn from a stated prior. Nothing here knows the 
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ballmodel.io import read
-from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
+from experiments.runs import run_dir
 from experiments.study.analysis import delays
 from experiments.study.analysis.identified import PRIOR_ALONE
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
@@ -39,10 +37,10 @@ BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of
 def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     """Ranges of the prior by dotted path. Raises ValueError naming ``where`` and the path at fault."""
     found = models.from_dict({"randomise": dict(data)}, where).randomise
-    for one in found:
-        if not isinstance(one, Range):
-            raise ValueError(f"{where}: samples; a prior has ranges")
-    return tuple(one for one in found if isinstance(one, Range))
+    ranges = tuple(one for one in found if isinstance(one, Range))
+    if len(ranges) < len(found):
+        raise ValueError(f"{where}: samples; a prior has ranges")
+    return ranges
 
 
 def identify(
@@ -52,7 +50,6 @@ def identify(
     before: Sequence[Range],
     hits: Sequence[Path] = (),
     seconds: float = 60.0,
-    say: Callable[[str], None] = lambda text: None,
 ) -> ModelFile:
     """The world to train in after these logs; its provenance says what it was made of.
 
@@ -72,10 +69,8 @@ def identify(
     arm, axes = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES))
     known = delays.compute_moments(ranges, arm)
     seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
-    balls_fit = of_balls.fit(balls, believed.model, seen, say)
-    say("fitting the drives")
+    balls_fit = of_balls.fit(balls, believed.model, seen)
     joints_fit = of_joints.fit(cut_middle(found.joints, seconds), believed.model, known) if found.joints else None
-    say("fitting the hits")
     hits_fit = _fit_hits(balls_fit, hits, believed.model, known)
     parts = [] if joints_fit is None else [joints_fit.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
@@ -87,7 +82,12 @@ def identify(
     unseen = [path for path in (delays.AXES, delays.BALL) if parts and path in ranges and path not in sampled]
     if unseen:
         parts.append(delays.draw_unseen(ranges, arm, unseen, of_balls.DRAWS))
-    samples = delays.shift_command(_join([_in_table_frame(balls_fit.samples(lift)), *parts]), axes)
+    # In the table frame it is the camera that is off, not the table's height: no ball before a hit can tell them apart.
+    of_flight = balls_fit.samples(lift)
+    parts.insert(0, replace(of_flight, paths=tuple(SEEN_HIGH if p == HEIGHT else p for p in of_flight.paths)))
+    drawn = np.concatenate([one.values for one in parts], axis=1)  # row by row side by side
+    drawn_paths = tuple(path for one in parts for path in one.paths)
+    samples = delays.shift_command(Samples(drawn_paths, drawn, np.ones(len(drawn))), axes)
     settled = {*samples.paths, *((delays.ARM,) if parts else ())}
     others: list[Randomised] = [one for one in before if one.path not in settled]
     covered = settled | {one.path for one in before}
@@ -111,11 +111,6 @@ def cut_middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRec
         return tuple(records)
     begin = 0.5 * (first + last - seconds)
     return tuple(r.between(begin, begin + seconds) for r in records)
-
-
-def _in_table_frame(drawn: Samples) -> Samples:
-    """The same with the camera's offset in place of the table's height, which no ball before a hit can tell apart."""
-    return replace(drawn, paths=tuple(SEEN_HIGH if path == HEIGHT else path for path in drawn.paths))
 
 
 def _fit_hits(
@@ -143,12 +138,6 @@ def _fit_hits(
     return of_hits.fit(balls_fit, balls, JointPath(times, places), known)
 
 
-def _join(parts: Sequence[Samples]) -> Samples:
-    """Samples of equal length and weight side by side, row by row."""
-    values = np.concatenate([one.values for one in parts], axis=1)
-    return Samples(tuple(path for one in parts for path in one.paths), values, np.ones(len(values)))
-
-
 def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -> None:
     """Writes balls with their hits, and the joints by the same clock, into a folder."""
     write_joints(folder, records)
@@ -158,14 +147,14 @@ def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -
 def write_joints(folder: Path, records: Collection[JointRecord]) -> None:
     """Writes command.csv and state.csv into a folder, as ``mjx-tt diagnose`` reads them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, quantity in zip(ROBOT_FILES, ("velocity", "position"), strict=True):
-        text = io.StringIO()
-        writer = csv.writer(text)
-        writer.writerow(("t", "joint", quantity))
-        for record in records:
-            command = quantity == "velocity"
-            time = record.command_time if command else record.state_time
-            values = record.command_velocity if command else record.state_position
-            writer.writerows((repr(float(t)), record.joint, repr(float(v))) for t, v in zip(time, values, strict=True))
-        with replacing(folder / name) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf-8")
+    parts = {
+        "velocity": [(r.joint, r.command_time, r.command_velocity) for r in records],
+        "position": [(r.joint, r.state_time, r.state_position) for r in records],
+    }
+    for file, (quantity, columns) in zip(ROBOT_FILES, parts.items(), strict=True):
+        rows = (
+            (repr(float(t)), joint, repr(float(v)))
+            for joint, time, values in columns
+            for t, v in zip(time, values, strict=True)
+        )
+        run_dir.write_csv(folder / file, ("t", "joint", quantity), rows)

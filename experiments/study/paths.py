@@ -22,26 +22,23 @@ class StudyPaths:
     def seed(self, seed: int) -> Path:
         return self.folder / f"seed{seed}"
 
-    def player(self, seed: int, player: str) -> Path:
-        return self.seed(seed) / player
-
     def model(self, seed: int, player: str, model: str) -> Path:
-        return self.player(seed, player) / model
+        return self.seed(seed) / player / model
 
     def balls(self, seed: int, player: str, name: str) -> Path:
         """Measured balls of a data set."""
-        return self.player(seed, player) / "balls" / f"{name}.csv"
+        return self.seed(seed) / player / "balls" / f"{name}.csv"
 
     def hits(self, seed: int, player: str, name: str) -> Path:
         """Folder of the hits that were logged in the play of a data set."""
-        return self.player(seed, player) / "hits" / name
+        return self.seed(seed) / player / "hits" / name
 
     def human(self, seed: int, player: str, name: str) -> Path:
-        return self.player(seed, player) / "balls" / f"human_{name}.yaml"
+        return self.seed(seed) / player / "balls" / f"human_{name}.yaml"
 
     def world(self, seed: int, player: str, name: str) -> Path:
         """An identified world as a model YAML."""
-        return self.player(seed, player) / "identified" / f"{name}.yaml"
+        return self.seed(seed) / player / "identified" / f"{name}.yaml"
 
     def run(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""

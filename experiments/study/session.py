@@ -26,11 +26,11 @@ from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
-from experiments.study import identification, training
+from experiments.study import identification
 from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
-from experiments.study.pipeline import Pipeline
+from experiments.study.pipeline import Pipeline, make_config
 from experiments.study.schedule import Simulated, list_items
-from experiments.study.target_domain import on_robot
+from experiments.study.target_domain import play_on_robot
 from experiments.study.workflow import Journal, Step, Waiting, list_unfinished, perform
 
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
@@ -50,19 +50,11 @@ def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) 
         pipeline = Pipeline(study, folder, console)
         _open(study, folder)
         try:
-            do_steps(study, folder, pipeline.steps(), console, workers)
+            with run_dir.continuable(folder, "every finished step", "the study"):
+                do_steps(study, folder, pipeline.steps(), console, workers)
         except Waiting as waiting:
             console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
             return False
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or folder}: {error.strerror or error}; every finished step is kept. "
-                "Make room or repair the folder, then run the same command again to continue"
-            ) from error
-        except KeyboardInterrupt as stopped:
-            raise KeyboardInterrupt(
-                f"{stopped}\n{folder}: stopped; the same command continues the study".lstrip()
-            ) from None
     console.print(f"report: {folder / REPORT}", highlight=False, soft_wrap=True)
     return True
 
@@ -73,12 +65,12 @@ def look_up(study: Study) -> None:
         build.distribution(balls, "ablation.balls")
     for item in list_items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
-            build.experiment(training.make_config(study, item, "narrow", None, 0), "simulation")
+            build.experiment(make_config(study, item, "narrow", None, 0), "simulation")
     if study.identification is not None:
         with error_context("identification"):
             identification.read_prior(study.identification.prior, "prior")
     if study.robot is not None:
-        on_robot.look_up(study, study.robot)
+        play_on_robot.look_up(study, study.robot)
 
 
 def _open(study: Study, folder: Path) -> None:

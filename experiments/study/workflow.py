@@ -8,14 +8,14 @@ a study killed at any moment ends as one that was left alone.
 from __future__ import annotations
 
 import json
-import os
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import ExperimentError, RunError
+from experiments.runs import lines
 
 
 class Waiting(ExperimentError):
@@ -40,6 +40,11 @@ class Step:
     compiled: Path | None = None
 
 
+def derive_seed(name: str) -> int:
+    """Seed of a step of that name."""
+    return zlib.crc32(name.encode()) >> 1
+
+
 class Journal:
     """The finished steps in the order of their ends: one JSON line each, on the disk before the next step begins.
 
@@ -48,47 +53,25 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path, self.steps = path, list[str]()
-        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-        whole = 0
-        for i, line in enumerate(lines):
-            try:
-                name = json.loads(line)["step"]
-            except (ValueError, KeyError, TypeError) as error:
-                if i < len(lines) - 1:
-                    raise RunError(f"{path}: line {i + 1} is no step ({error}); restore the file") from None
-                break
-            if not line.endswith(b"\n"):
-                break
-            self.steps.append(name)
-            whole += len(line)
-        if path.exists():
-            os.truncate(path, whole)
+        lines.read(path, lambda line: self.steps.append(json.loads(line)["step"]), "step")
 
     def append(self, name: str, seconds: float) -> None:
         """Marks a step as done. Raises OSError."""
-        with open(self.path, "ab") as file:
-            file.write(json.dumps({"step": name, "seconds": round(seconds, 2)}).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        sync_folder(self.path.parent)
+        lines.append(self.path, json.dumps({"step": name, "seconds": round(seconds, 2)}).encode() + b"\n")
         self.steps.append(name)
-
-    def index(self, step: Step) -> int | None:
-        """Index of the step's last mark; None without one."""
-        return max((i for i, name in enumerate(self.steps) if name == step.name), default=None)
 
 
 def list_unfinished(steps: list[Step], journal: Journal) -> list[Step]:
     """The steps that are still to be done, in their order."""
-    makers = {path: step for step in steps for path in step.outputs}
-    left: list[Step] = []
+    makers = {path: step.name for step in steps for path in step.outputs}
+    marks = {name: i for i, name in enumerate(journal.steps)}  # of each step the last one
+    left: dict[str, Step] = {}
     for step in steps:
-        mark = journal.index(step)
-        sources = {makers[path].name: makers[path] for path in step.inputs if path in makers}.values()
-        stale = any(source in left or (journal.index(source) or 0) > (mark or 0) for source in sources)
+        mark, sources = marks.get(step.name), {makers[path] for path in step.inputs if path in makers}
+        stale = any(source in left or marks.get(source, 0) > (mark or 0) for source in sources)
         if mark is None or stale or not all(path.exists() for path in step.outputs):
-            left.append(step)
-    return left
+            left[step.name] = step
+    return list(left.values())
 
 
 def perform(step: Step) -> tuple[str, float]:

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from experiments.runs import metrics
 from experiments.runs.run_dir import Run
 from experiments.stats import welch_interval
+from experiments.study.analysis import scoring
 from experiments.study.analysis.paper import BY_SKILL, CLAIMS, FINAL, TEN, Claim, of_level
 from experiments.study.analysis.scoring import Rallies
 from experiments.study.analysis.statistics import (
@@ -39,29 +41,17 @@ TUNED = {"is2r-sim1": "is2r-ft35", "is2r-sim2": "is2r-ft65", "is2r-sim3": "is2r-
 """Zero-shot policies, and what fine-tuning makes of them."""
 SMOOTH = 10  # updates over which a fine-tuning's return rate is averaged
 ONE_SEED = "the players of one seed alone, who share its reality"
-AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS = (
-    "agrees",
-    "agrees in direction",
-    "differs",
-    "undecided",
-    "not comparable",
-)
+VERDICTS = "agrees", "agrees in direction", "differs", "undecided", "not comparable"
+AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS
 RATIO, DIFFERENCE, SHARE, HITS = "ratio", "difference", "share", "hits"
 NULL = {RATIO: 1.0, DIFFERENCE: 0.0, SHARE: 0.5}
 """Value of "no difference" by unit."""
-UNITS = {
-    "length_ratio": RATIO,
-    "kept_ratio": RATIO,
-    "model_change": RATIO,
-    "model_change_by_level": RATIO,
-    "tuning_cost": RATIO,
-    "normalised_difference": DIFFERENCE,
-    "short_share_difference": DIFFERENCE,
-    "longer_share": SHARE,
-    "robot_ended_share": SHARE,
-    "mean_length": HITS,
-    "longest_rally": HITS,
-}
+UNITS = (
+    dict.fromkeys(("length_ratio", "kept_ratio", "model_change", "model_change_by_level", "tuning_cost"), RATIO)
+    | dict.fromkeys(("normalised_difference", "short_share_difference"), DIFFERENCE)
+    | dict.fromkeys(("longer_share", "robot_ended_share"), SHARE)
+    | dict.fromkeys(("mean_length", "longest_rally"), HITS)
+)
 """Unit of each statistic, a method of ``Measurements``."""
 Changes = dict[tuple[int, str], tuple[float, float]]  # of the human model, M0 to M1 and M1 to M2, by seed and player
 
@@ -171,12 +161,30 @@ class Measurements:
         return Bootstrap(rallies, ended).mean(TEN, BY_SKILL)
 
     def model_change(self, group: str = "all") -> Interval | None:
-        """Second change of the human model over the first, over the players of a group."""
-        return model_change(self.changes, group)
+        """Geometric mean of the human model's second change over its first, over the players of a group."""
+        players = of_level(group)
+        both = {(s, p): ab for (s, p), ab in self.changes.items() if min(ab) > 0 and p in players}
+        return _geometric_mean({key: float(np.log(b / a)) for key, (a, b) in both.items()})
 
     def model_change_by_level(self) -> Interval | None:
-        """Second change of the human model, beginners over intermediate players."""
-        return model_change_by_level(self.changes)
+        """Second change of beginners over that of intermediate players, geometric means.
+
+        Student's t over seeds; of one seed Welch's interval over players.
+        """
+        logs: dict[int, tuple[list[float], list[float]]] = {}
+        for (seed, player), (_, second) in self.changes.items():
+            for k, level in enumerate(("beginner", "intermediate")):
+                if player in of_level(level) and second > 0:
+                    logs.setdefault(seed, ([], []))[k].append(float(np.log(second)))
+        both = {seed: pair for seed, pair in logs.items() if all(pair)}
+        if len(both) > 1:
+            apart = {(s, ""): float(np.mean(a) - np.mean(b)) for s, (a, b) in both.items()}
+            return exponentiate(average_over_seeds(apart))
+        beginners, intermediate = next(iter(both.values()), ([], []))
+        if min(len(beginners), len(intermediate)) < 2:
+            return None
+        count = len(beginners) + len(intermediate)
+        return exponentiate(Interval(*welch_interval(intermediate, beginners), count, ONE_SEED))
 
     def tuning_cost(self) -> Interval | None:
         """Updates of fine-tuning after a player's worst zero-shot policy over those after the best, to an equal level.
@@ -211,40 +219,12 @@ class Measurements:
         return Bootstrap(rallies.take(good), values[good], longest=True)
 
 
-def model_change(changes: Changes, group: str = "all") -> Interval | None:
-    """Geometric mean of the second change over the first, over the players of a group."""
-    players = of_level(group)
-    return _geometric_mean(
-        {(s, p): float(np.log(b / a)) for (s, p), (a, b) in changes.items() if a > 0 and b > 0 and p in players}
-    )
-
-
 def _geometric_mean(logs: dict[tuple[int, str], float]) -> Interval | None:
     """Of two logarithms by seed and player at least: Student's t over seeds, over players where there is one."""
     if len(logs) < 2:
         return None
     found = average_over_seeds(logs)
     return exponentiate(found if found.n > 1 else replace(t_mean([*logs.values()]), over=ONE_SEED))
-
-
-def model_change_by_level(changes: Changes) -> Interval | None:
-    """Second change of beginners over that of intermediate players, geometric means.
-
-    Student's t over seeds; of one seed Welch's interval over players.
-    """
-    logs: dict[int, tuple[list[float], list[float]]] = {}
-    for (seed, player), (_, second) in changes.items():
-        for k, level in enumerate(("beginner", "intermediate")):
-            if player in of_level(level) and second > 0:
-                logs.setdefault(seed, ([], []))[k].append(float(np.log(second)))
-    both = {seed: pair for seed, pair in logs.items() if all(pair)}
-    if len(both) > 1:
-        return exponentiate(average_over_seeds({(s, ""): float(np.mean(a) - np.mean(b)) for s, (a, b) in both.items()}))
-    beginners, intermediate = next(iter(both.values()), ([], []))
-    if min(len(beginners), len(intermediate)) < 2:
-        return None
-    count = len(beginners) + len(intermediate)
-    return exponentiate(Interval(*welch_interval(intermediate, beginners), count, ONE_SEED))
 
 
 def paper_changes(player: str) -> tuple[float, float]:
@@ -254,10 +234,11 @@ def paper_changes(player: str) -> tuple[float, float]:
 
 def paper_number(claim: Claim) -> float | None:
     """The number that the paper states, or that follows from its human models."""
-    of_models = {"model_change": model_change, "model_change_by_level": model_change_by_level}.get(claim.statistic)
-    if of_models is None:
+    if claim.statistic not in ("model_change", "model_change_by_level"):
         return claim.paper
-    interval = of_models({(0, player): paper_changes(player) for player in BY_SKILL}, **claim.of)
+    paper = Measurements(StudyFolder(Path(), {}, scoring.join([])))
+    paper.changes = {(0, player): paper_changes(player) for player in BY_SKILL}
+    interval = getattr(paper, claim.statistic)(**claim.of)
     return None if interval is None else interval.value
 
 
@@ -284,13 +265,11 @@ def judge(expect: str, unit: str, interval: Interval, paper: float | None) -> tu
     wide = high > WIDEST * low
     holds = paper is not None and low <= paper <= high
     if expect == "number":
-        if holds and wide:
+        if not holds:
+            return DIFFERS, f"{where} does not hold the paper's number"
+        if wide:
             return UNDECIDED, f"{where} holds the paper's number, but is too wide to tell"
-        return (
-            (AGREES, f"{where} holds the paper's number")
-            if holds
-            else (DIFFERS, f"{where} does not hold the paper's number")
-        )
+        return AGREES, f"{where} holds the paper's number"
     null = NULL[unit]
     inside = low <= null <= high
     if expect == "alike":

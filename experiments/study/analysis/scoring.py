@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballmodel.io.atomic_files import replacing
 from experiments.errors import ConfigError, error_context
+from experiments.runs import run_dir
 from mjx_tt.rally.end_reasons import ROWS, End
 
 POOL = 60
@@ -28,6 +27,8 @@ NUMBERS = {str(number): end for number, (end, *_) in enumerate(ROWS, 1)}
 """End by its number on a scoring sheet, that of the row in the paper's table."""
 UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
 COLUMNS = tuple("seed trainer evaluator model blind rally length end robot_ended filtered selected".split())
+KINDS = (int, object, object, object, object, int, int, int, int, bool, bool)
+DTYPE = [*zip(COLUMNS, KINDS, strict=True), ("pooled", bool)]
 
 
 def parse_end(text: str) -> End:
@@ -67,33 +68,16 @@ def choose_reported(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
     return chosen
 
 
-@dataclass(frozen=True)
-class Rallies:
-    """Rallies of any number of evaluations, one element each, arrays of one length.
+class Rallies(np.recarray):
+    """Rallies of any number of evaluations, with the columns of DTYPE.
 
     robot_ended is 1, 0 or UNKNOWN; length counts the paddle touches of human and robot; pooled: among the first 60 of
     an evaluation that count, of which the longest are ``selected``.
     """
 
-    seed: np.ndarray
-    trainer: np.ndarray
-    evaluator: np.ndarray
-    model: np.ndarray
-    blind: np.ndarray
-    rally: np.ndarray
-    length: np.ndarray
-    end: np.ndarray
-    robot_ended: np.ndarray
-    filtered: np.ndarray
-    pooled: np.ndarray
-    selected: np.ndarray
-
-    def __len__(self) -> int:
-        return self.length.size
-
-    def take(self, where: np.ndarray) -> Rallies:
+    def take(self, where: np.ndarray) -> Rallies:  # type: ignore[override]
         """The rallies at a mask or at indices."""
-        return Rallies(*(getattr(self, f.name)[where] for f in fields(self)))
+        return self[where]
 
     @property
     def own(self) -> np.ndarray:
@@ -102,29 +86,36 @@ class Rallies:
 
 
 def score_rallies(
-    seed: int, trainer: str, evaluator: str, model: str, blind: str, length: ArrayLike, end: ArrayLike
+    seed: int,
+    trainer: str,
+    evaluator: str,
+    model: str,
+    blind: str,
+    length: ArrayLike,
+    end: ArrayLike,
+    rally: ArrayLike | None = None,
 ) -> Rallies:
-    """One evaluation's rallies, in the order of play. length: (n,) touches; end: (n,) End."""
+    """One evaluation's rallies, in the order of play.
+
+    length: (n,) touches; end: (n,) End; rally: (n,) their numbers, from 0 by default.
+    """
     length, end = np.asarray(length, int), np.asarray(end, int)
-    names = dict(seed=seed, trainer=trainer, evaluator=evaluator, model=model, blind=blind)
-    filtered = np.isin(end, [int(e) for e in FILTERED])
+    rallies = np.recarray(length.size, DTYPE).view(Rallies)
+    for name, value in zip(COLUMNS, (seed, trainer, evaluator, model, blind), strict=False):
+        rallies[name] = value
+    rallies.length, rallies.end = length, end
+    rallies.rally = np.arange(length.size) if rally is None else rally
     ended = [ROBOT_ENDED.get(End(e)) for e in end.tolist()]
-    return Rallies(
-        **{name: np.full(length.size, value) for name, value in names.items()},
-        rally=np.arange(length.size),
-        length=length,
-        end=end,
-        robot_ended=np.array([UNKNOWN if e is None else int(e) for e in ended], int),
-        filtered=filtered,
-        pooled=choose_pool(filtered),
-        selected=choose_reported(length, filtered),
-    )
+    rallies.robot_ended = [UNKNOWN if e is None else int(e) for e in ended]
+    rallies.filtered = np.isin(end, [int(e) for e in FILTERED])
+    rallies.pooled = choose_pool(rallies.filtered)
+    rallies.selected = choose_reported(length, rallies.filtered)
+    return rallies
 
 
 def join(parts: Iterable[Rallies]) -> Rallies:
     """Rallies one after the other; without any, an empty one."""
-    parts = list(parts) or [score_rallies(0, "", "", "", "", [], [])]
-    return Rallies(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rallies)))
+    return np.concatenate([np.recarray(0, DTYPE), *parts]).view(Rallies)
 
 
 def write(path: Path, rallies: Rallies) -> None:
@@ -134,10 +125,7 @@ def write(path: Path, rallies: Rallies) -> None:
     columns["robot_ended"] = ["" if e == UNKNOWN else e for e in columns["robot_ended"]]
     for name in ("filtered", "selected"):
         columns[name] = [int(flag) for flag in columns[name]]
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(zip(*columns.values(), strict=True))
+    run_dir.write_csv(path, COLUMNS, zip(*columns.values(), strict=True))
 
 
 def read(path: Path) -> Rallies:
@@ -161,5 +149,5 @@ def read(path: Path) -> Rallies:
     parts = []
     for group, played_ones in evaluations.items():
         numbers, lengths, ends = zip(*sorted(played_ones, key=lambda p: p[0]), strict=True)
-        parts.append(replace(score_rallies(*group, lengths, ends), rally=np.array(numbers)))
+        parts.append(score_rallies(*group, lengths, ends, numbers))
     return join(parts)

@@ -147,7 +147,8 @@ class Bootstrap:
 
     def _find(self, models: Models, trainers: Iterable[str], own: bool | None) -> list[Cell]:
         models, trainers = (models,) if isinstance(models, str) else tuple(models), tuple(trainers)
-        return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
+        chosen = (cell for cell in self.cells if cell[3] in models and cell[1] in trainers)
+        return [cell for cell in chosen if own is None or (cell[1] == cell[2]) == own]
 
     def _mean(self, found: list[Cell]) -> Estimate:
         """Mean over the cells (at least one) of a trainer, then over trainers, then over seeds."""
@@ -218,7 +219,3 @@ def t_mean(values: ArrayLike) -> Interval:
     if values.size < 2:
         return Interval(float(values.mean()) if values.size else float("nan"), -np.inf, np.inf, values.size)
     return Interval(*t_interval(values), values.size)
-
-
-def _is(own: bool | None, cell: Cell) -> bool:
-    return own is None or (cell[1] == cell[2]) == own

@@ -125,24 +125,19 @@ def load(folder: Path) -> StudyFolder:
         raise ConfigError(f"{folder}: is no study: neither {SETTINGS} nor {EVALUATIONS} is there")
     rallies = scoring.read(evaluated) if evaluated.exists() else scoring.join([])
     known, unknown = _known(rallies)
-    study = StudyFolder(folder, _settings(asked), rallies.take(known))
+    settings: dict[str, Any] = {}
+    if asked.exists():
+        with error_context(str(asked)):
+            settings = read_yaml(asked)
+            if not isinstance(settings, dict):
+                raise ValueError(f"expected a mapping, got {type(settings).__name__}")
+    study = StudyFolder(folder, settings, rallies.take(known))
     if not study.players:
         if unknown:
             raise ConfigError(f"{evaluated}: the figures have no place for any of its rallies: {'; '.join(unknown)}")
         raise ConfigError(f"{folder}: nothing to report on yet: there is no player's folder and no rally")
     study.missing = [*(f"a place for rallies with {which}" for which in unknown), *_missing(study)]
     return study
-
-
-def _settings(path: Path) -> dict[str, Any]:
-    """A study's YAML; empty where there is none."""
-    if not path.exists():
-        return {}
-    with error_context(str(path)):
-        content = read_yaml(path)
-        if not isinstance(content, dict):
-            raise ValueError(f"expected a mapping, got {type(content).__name__}")
-        return content
 
 
 def _missing(study: StudyFolder) -> list[str]:

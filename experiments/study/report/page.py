@@ -13,6 +13,7 @@ import matplotlib
 import yaml
 from markupsafe import Markup, escape
 
+from experiments.runs import run_dir
 from experiments.study.analysis.claims import NOT_COMPARABLE, PLAYS, VERDICTS, WIDEST, Measurements
 from experiments.study.analysis.scoring import KEEP
 from experiments.study.analysis.statistics import FEWEST_SEEDS, name_chance
@@ -32,7 +33,7 @@ def write(folder: Path) -> Path:
     page, found = compose(load(folder))
     page.write(target, target.parent)
     for name, content in found.items():
-        content.write(target.parent / f"{name}.csv")
+        run_dir.write_csv(target.parent / f"{name}.csv", content.head, content.rows)
     return target
 
 

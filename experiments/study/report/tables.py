@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ballmodel import registry
-from ballmodel.io.atomic_files import replacing
 from experiments.study.analysis.claims import HITS, Measurements, paper_changes, show, show_interval
 from experiments.study.analysis.identified import holds, list_estimates
 from experiments.study.analysis.paper import CROSS, FINAL, GROUPS, METHOD_OF, SHORT, TEN, level, of_level
@@ -29,11 +26,6 @@ class Table:
     head: Row
     rows: Sequence[Row]
     right: Sequence[int] = ()
-
-    def write(self, path: Path) -> None:
-        """Writes it as CSV."""
-        with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([self.head, *self.rows])
 
 
 def tabulate_claims(m: Measurements) -> Table:

@@ -1,47 +1,186 @@
-"""Play of a study's policies on a robot: the choice among seeds, and the final evaluation.
+"""A study on a robot: the loop waits for its operator, who fine-tunes by ``mjx-tt finetune``, and for its players.
 
+A step that people do is started here with the same code as the command of its own, and goes on where it was left. What
+they have not finished ends the program with a sentence that says what to do; the same command then continues the study.
 The evaluation is a virtual player's rallies on the rig, or people's with policies under code names.
 """
 
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from experiments import sparse_reward
-from experiments.deploy import play
+from ballmodel.io import read
+from ballmodel.trajectory import Dataset, Trajectory
+from experiments import measurements, sparse_reward
+from experiments.config import robot as robots
+from experiments.config.study import Study
+from experiments.deploy import play, session_logs
+from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, RunError, error_context
 from experiments.finetuning import loop
+from experiments.finetuning import on_robot as tuning
+from experiments.finetuning.robot import SCENE, BallRecorder
 from experiments.options import LOCK_STEP, RIG, RobotOptions
 from experiments.runs import load_policy
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study import blind_protocol
 from experiments.study.analysis import scoring
-from experiments.study.workflow import Step, Waiting
+from experiments.study.target_domain.lab_logs import HitLog
+from experiments.study.workflow import Step, Waiting, derive_seed
 from experiments.training import finalize
+from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
 from mjx_tt.rally.end_reasons import End
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
 from robot_io.policy import artefact as artefacts
 
+BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of the joints before and after them
+LEAST_SAMPLES = 20  # of a ball that is looked at
+LONGEST_SERVICE, FEWEST_SERVICES = 2.0, 5  # [s] from ball to ball; one in five at least can be used
 LOGS = "selection"  # folder of a run
 SESSIONS = 3  # on the rig at most in one go, until all rallies are played: a busy machine ends some by its own faults
 
 
-def derive_seed(name: str) -> int:
-    """Seed of a step of that name."""
-    return zlib.crc32(name.encode()) >> 1
+def look_up(study: Study, robot: str) -> None:
+    """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
+    if robot not in (RIG, LOCK_STEP):
+        try:
+            robots.load_robot(robot)
+        except ConfigError as error:
+            raise ConfigError(f"robot: {error}") from None
+    for player in study.recordings:
+        load_recording(study, player)
+    if study.identification is not None and study.identification.joints is not None:
+        given = Path(study.identification.joints)
+        with error_context("identification.joints"):
+            load_logs([given / file for file in ROBOT_FILES])
+
+
+def load_recording(study: Study, player: str) -> Dataset:
+    """Balls of a player recorded before the study. Raises ConfigError naming the key and what is wrong."""
+    where, path = f"recordings.{player}", study.recording(player)
+    with error_context(where):
+        measured = read(path)
+    if not isinstance(measured, Dataset):
+        raise ConfigError(f"{where}: {path} holds start states; measured trajectories are needed")
+    return measured
+
+
+class RobotWorld:
+    """A robot, as in ``study.robot``, and the people who play with it."""
+
+    def __init__(self, study: Study, robot: str, console: Console) -> None:
+        self._study, self._robot, self._console = study, robot, console
+
+    def first_balls(self, player: str, name: str) -> Dataset:
+        """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
+        serves. Raises ConfigError as ``load_recording`` does."""
+        if player not in self._study.recordings:
+            return serve_balls(player, self._study.first_balls, derive_seed(name), name.rsplit("/", 1)[-1])
+        measured = load_recording(self._study, player)
+        # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
+        label = name.rsplit("/", 1)[-1]
+        tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
+        return Dataset(tracks, self._study.recording(player))
+
+    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
+        study = self._study
+        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": derive_seed(name)})
+        balls = settings.updates * settings.episodes_per_update
+        self._console.print(
+            f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
+            f"{settings.evaluation_balls} to compare; the operator's keys are those of mjx-tt finetune",
+            highlight=False,
+            soft_wrap=True,
+        )
+        opponent = player if self._robot == RIG else None
+        setup = RobotOptions(seed=derive_seed(name), player=opponent)
+        found = tuning.finetune(str(source), settings, Run(folder), self._robot, self._console, setup)
+        if found is None:
+            raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
+        measured = measurements.read_trajectories([folder / loop.HUMAN_BALLS])
+        change = found["difference"]["mean_return"]
+        return measured, f"{settings.updates} updates, {len(measured):,} balls, mean return changed by {change:+.2f}"
+
+    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
+        """The last balls of the fine-tuning in ``folder``, from the longest session's log."""
+        found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_size)
+        if not found:
+            raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
+        flights, joints = session_logs.load(found[-1])
+        strokes = (stroke for t in flights for stroke in split_by_stroke(t))
+        kept = sorted((t for t in strokes if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
+        if not kept or not joints:
+            raise RunError(f"{found[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
+        begin, end = kept[0].time[0] - AROUND, max(t.time[-1] for t in kept) + AROUND
+        tracks = tuple(replace(t, session=name, name=str(i)) for i, t in enumerate(kept))
+        return HitLog(Dataset(tracks, name), tuple(r.between(begin, end) for r in joints))
+
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
+        """Function that scores a policy on the robot; None where scores are not needed."""
+        simulation, seed = self._study.simulation, derive_seed(name)
+        if simulation.seeds == 1:
+            return None
+        self._console.print(f"{name}: {player} to the table", highlight=False)
+        return lambda p: score(p, self._robot, simulation.selection_episodes, seed, self._console)
+
+
+class StandStill:
+    """A policy that does not move."""
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(len(observation) - 3)
+
+
+def serve_balls(player: str, count: int, seed: int, session: str) -> Dataset:
+    """Balls that a virtual player serves, as the emulated trackers measured them; the robot stands still."""
+    recorder = BallRecorder()
+    rig = LockStep(SCENE, VirtualPlayer(player, seed), StandStill(), RigParams(seed=seed % 2**31), recorder=recorder)
+    rig.throwing = True
+    found: tuple[Trajectory, ...] = ()
+    while len(found) < count:
+        before = len(found)
+        rig.run(LONGEST_SERVICE * max(count - before, FEWEST_SERVICES))
+        tracks = (recorder.trajectory(ball) for ball in recorder.balls)
+        whole = [track for track in tracks if len(track) >= LEAST_SAMPLES]
+        found = tuple(Trajectory(session, str(i), t[:, 0], t[:, 1:].T) for i, t in enumerate(whole[:count]))
+        if len(found) == before:
+            raise RunError(f"{player} serves no ball on the rig")
+    return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
+
+
+def split_by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
+    """A rally's track from each stroke of the person to the next one, the robot's hit between them."""
+    cuts, away, farthest = [0], False, 0  # away from the robot; sample at which the ball was farthest that way
+    y = track.position[1]
+    for i in range(len(y)):
+        ahead = y[i] - y[farthest] if away else y[farthest] - y[i]
+        if ahead >= 0.0:
+            farthest = i
+        elif -ahead > TURN:
+            if away:
+                cuts.append(farthest)
+            away, farthest = not away, i
+    return tuple(track.part(a, b) for a, b in pairwise([*cuts, len(y)]))
 
 
 def export_once(trained: TrainedPolicy, console: Console) -> Path:
     """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
     folder = Run(trained.source).artefact
-    if not (folder / "manifest.json").exists():
+    if not (folder / artefacts.MANIFEST).exists():
         experiment = loop.experiment_of(trained.source)
         if not finalize.export_policy(folder, trained, experiment, None, console):
             raise ConfigError(f"{trained.source}: acts at another rate than the robot")

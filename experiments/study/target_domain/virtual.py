@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -37,8 +36,9 @@ from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.analysis import delays, scoring
-from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.hit_log import HitLog
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.lab_logs import HitLog, record_hits, record_joints
+from experiments.study.workflow import derive_seed
 from experiments.training.update import TrainState
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.env.episode import MISSED, RETURNED
@@ -53,6 +53,7 @@ from mjx_tt.sim.model import SimModel
 SELECTION_SESSIONS = 10  # side by side in which policies are compared
 ATTEMPTS = 100  # of a ball, after which a player who brings none onto the robot's half is taken as they are
 STUDY, EVALUATION = 6, 7  # purposes of keys, beside those of experiments.config.build
+Carry = tuple[BGSState, RallyState, ObservationStatistics]
 
 
 @dataclass(frozen=True)
@@ -123,15 +124,13 @@ class VirtualReality:
         sessions = self._settings.episodes_per_update
         rally = self.simulator.start(player, self.known, rally_key, sessions)
         # Strongly typed as what the updates return, so that the first call and the others are one program.
-        state, rally, statistics = jax.tree.map(
+        carry: Carry = jax.tree.map(
             lambda x: jax.lax.convert_element_type(x, x.dtype),
             (strategy.init(jnp.asarray(theta), config), rally, statistics),
         )
         found = []
         for _ in range(updates // self._chunk):
-            state, rally, statistics, part = self._updates(
-                state, rally, statistics, player, self.known, ask_key, play_key, config=config
-            )
+            carry, part = self._updates(carry, player, self.known, ask_key, play_key, config=config)
             found.append(jax.tree.map(np.asarray, part))
         shots, info = jax.tree.map(lambda *x: np.concatenate(x), *found)
         hits = jax.tree.map(lambda x: np.moveaxis(x, 1, 0).reshape(3, -1), shots.ball)  # (updates, 3, L) -> (3, n)
@@ -144,7 +143,7 @@ class VirtualReality:
             | {name: float(getattr(info, name)[u]) for name in ("gradient_norm", "update_norm", "elite_std")}
             for u in range(updates)
         ]
-        return Cycle(TrainState(state, statistics, ask_key), rows, measured.trajectories(session))
+        return Cycle(TrainState(carry[0], carry[2], ask_key), rows, measured.trajectories(session))
 
     def score(self, player: Player, policy: Policy, balls: int, key: PRNGKeyArray) -> float:
         """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls with the player."""
@@ -154,22 +153,17 @@ class VirtualReality:
 
     def _updates_of(
         self,
-        state: BGSState,
-        rally: RallyState,
-        statistics: ObservationStatistics,
+        carry: Carry,
         player: Player,
         model: SimModel,
         key: PRNGKeyArray,
         play_key: PRNGKeyArray,
         config: BGSConfig,
-    ) -> tuple[BGSState, RallyState, ObservationStatistics, tuple[ShotResult, BGSInfo]]:
-        """``_chunk`` updates: state, rally and statistics after them, and each one's (ShotResult, BGSInfo)."""
+    ) -> tuple[Carry, tuple[ShotResult, BGSInfo]]:
+        """``_chunk`` updates: state, rally and statistics after them, and what each one brought."""
         settings, sessions = self._settings, self._settings.episodes_per_update
-        merging = settings.observation_statistics == "merged"
 
-        def update(
-            carry: tuple[BGSState, RallyState, ObservationStatistics], _: None
-        ) -> tuple[tuple[BGSState, RallyState, ObservationStatistics], tuple[ShotResult, BGSInfo]]:
+        def update(carry: Carry, _: None) -> tuple[Carry, tuple[ShotResult, BGSInfo]]:
             state, rally, statistics = carry
             mean, inv_std = normalizer.normaliser(statistics)
             frozen = [_repeat_per_session(x, sessions) for x in (mean, inv_std)]
@@ -179,14 +173,13 @@ class VirtualReality:
             rally, shots = self._valid_shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.num_directions, settings.repeats).mean(axis=1)
             state, info = strategy.tell(state, population, returns, config)
-            if merging:
+            if settings.observation_statistics == "merged":
                 seen = jnp.where(shots.finite, shots.observed, 0.0).sum(axis=-1)
                 steps = jnp.where(shots.finite, shots.steps, 0).sum()
                 statistics = normalizer.merge(statistics, normalizer.from_sums(steps, mean, *seen))
             return (state, rally, statistics), (shots, info)
 
-        after, found = jax.lax.scan(update, (state, rally, statistics), None, length=self._chunk)
-        return *after, found
+        return jax.lax.scan(update, carry, None, length=self._chunk)
 
     def _valid_shots(
         self, policy: Policy, player: Player, model: SimModel, rally: RallyState, key: PRNGKeyArray
@@ -200,9 +193,8 @@ class VirtualReality:
             return attempt + 1, *replayed
 
         first = self.simulator.shots(policy, player, model, rally, key)
-        replays = (jnp.int32(1), *first)
         _, rally, shots = jax.lax.while_loop(
-            lambda c: (c[0] < ATTEMPTS) & ~jnp.all(c[2].valid | c[2].fault), again, replays
+            lambda c: (c[0] < ATTEMPTS) & ~jnp.all(c[2].valid | c[2].fault), again, (jnp.int32(1), *first)
         )
         return rally, shots
 
@@ -248,16 +240,21 @@ def play_rallies(
 
     balls: what each policy was trained for
     """
-    sessions, settings = study.evaluation.lanes, study.evaluation
+    settings, sessions = study.evaluation, study.evaluation.lanes
+
+    def stack(*arrays: ArrayLike) -> Array:
+        """(..., n * sessions), the sessions of one side by side."""
+        return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), sessions, axis=-1)
+
     people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
-    policy, box = _stack(policies, balls, sessions)
+    boxes = [Box.of(one) for one in balls]
     result = reality.simulator.play(
-        policy,
+        jax.tree.map(stack, *policies),
         jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), people),
         reality.known,
         build.key(seed, EVALUATION),
         settings.rallies // sessions,
-        box,
+        Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes))),
         settings.max_touches,
     )
     # (rallies of a session, sessions of all pairings): those of a pairing count as one session.
@@ -268,16 +265,6 @@ def play_rallies(
     )
 
 
-def _stack(policies: Sequence[Policy], balls: Sequence[Balls], sessions: int) -> tuple[Policy, Box]:
-    """Policies and the boxes of their balls, one (..., n * sessions) array each, the sessions of one side by side."""
-
-    def stack(*arrays: ArrayLike) -> Array:
-        return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), sessions, axis=-1)
-
-    boxes = [Box.of(one) for one in balls]
-    return jax.tree.map(stack, *policies), Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes)))
-
-
 class VirtualWorld:
     """A seed's reality for the loop, as ``RobotWorld``; all chance follows from ``name``, that of a step."""
 
@@ -285,7 +272,7 @@ class VirtualWorld:
         self._study, self._seed, self.reality = study, seed, reality.at(seed)
 
     def _key(self, name: str) -> PRNGKeyArray:
-        return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
+        return jax.random.fold_in(build.key(self._seed, STUDY), derive_seed(name))
 
     def first_balls(self, player: str, name: str) -> Dataset:
         """The player's balls across the table, without a robot."""
@@ -295,14 +282,14 @@ class VirtualWorld:
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
-        return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
+        return record_joints(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
 
     def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
         """Balls of rallies with the policy of the run ``source``."""
         reality, policy = self.reality, load_policy.load(source).policy
         person, noise = reality.player(player), self._study.reality.camera_noise
         late = models.paths(build.believed(self._study.simulation.model).model)[delays.BALL]
-        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
+        return record_hits(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""

@@ -114,4 +114,4 @@ def test_a_robot_whose_trackers_frame_no_known_point_has_shown_stays_slow(tmp_pa
         with pytest.raises(ConfigError, match=r"calibration.tracker: expected one at safety.speed_scale 0.25"):
             load_installed(str(path), tmp_path, PAPER, tmp_path)
     else:
-        assert load_installed(str(path), tmp_path, PAPER, tmp_path).config.safety.speed_scale == scale
+        assert load_installed(str(path), tmp_path, PAPER, tmp_path)[0].safety.speed_scale == scale

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import first_day
-from experiments.deploy.commission import Commissioning, NotProven, Record
+from experiments.deploy.commission import STEPS, Commissioning, NotProven, Record
 from mjx_tt.robot import robots as simulated
 from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
@@ -96,15 +96,14 @@ def commissioning(tmp_path, params=RIG, done=(), **answers):
 def test_a_hidden_mistake_is_found_at_its_step(tmp_path, name):
     """Steps before it are taken as proven, but for those that it goes through without being found there."""
     params, change, answers, step, named = MISTAKES[name]
-    names = list(commissioning(tmp_path)[0].steps)
-    first = min(names.index(each) for each in step.split("|"))
-    done = names[:first] if first > names.index("bounces") else ()
+    first = min(STEPS.index(each) for each in step.split("|"))
+    done = STEPS[:first] if first > STEPS.index("bounces") else ()
     made, session, person = commissioning(tmp_path, params, done, **answers)
     if change is not None:
         change(session)
     with pytest.raises(NotProven, match=f"^({step}): .*{named}"):
         made.run()
-    assert not {*Record.of(tmp_path / "robot.yaml").proven} & {*names[first:], *step.split("|")} or "|" in step
+    assert not {*Record.of(tmp_path / "robot.yaml").proven} & {*STEPS[first:], *step.split("|")} or "|" in step
     session.rig.run(1.0)
     assert session.rig.world.collisions == 0
 
@@ -114,7 +113,7 @@ def test_a_right_robot_is_proven_whole_and_resumed(tmp_path):
     made, session, person = commissioning(tmp_path)
     made.run()
     record = yaml.safe_load((tmp_path / "robot.commissioning.yaml").read_text())
-    assert list(record["proven"]) == list(made.steps) and len(person.said) == len(made.steps)
+    assert list(record["proven"]) == STEPS and len(person.said) == len(STEPS)
     assert not session.rig.bridge.gate.faults and session.rig.world.collisions == 0
     again, _, person = commissioning(tmp_path)
     again.run()
@@ -138,6 +137,6 @@ def test_over_real_sockets_in_real_time(tmp_path, name):
             if not re.search(STALLED, console.export_text(clear=False).splitlines()[-1]):
                 break
     if name is None:
-        assert status == 0 and list(Record.of(path).proven) == list(Commissioning(*[None] * 2, rig.robot, None).steps)
+        assert status == 0 and list(Record.of(path).proven) == STEPS
     else:
         assert status == 1 and re.search(f"not proven: ({step}): .*{named}", console.export_text())

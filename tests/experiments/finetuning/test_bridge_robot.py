@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from experiments.finetuning.bridge_robot import COMPUTING, BridgeRobot
+from experiments.finetuning.on_robot import COMPUTING, BridgeRobot
 from robot_io.control import messages
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy

@@ -103,9 +103,7 @@ def tune(source: Path, folder: Path, robot, operator=None, **settings):
 
 
 def entries(folder: Path) -> list[Entry]:
-    journal = Journal(folder / loop.JOURNAL)
-    journal.close()
-    return journal.entries
+    return Journal(folder / loop.JOURNAL).entries
 
 
 def last_theta(folder: Path) -> np.ndarray:
@@ -491,6 +489,3 @@ def test_stop_and_continue_and_pause(source, whole, tmp_path):
     assert tune(source, tmp_path / "run", Toy(), person) is not None
     assert person.looks < 0
     np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(whole))
-
-
-# Measurements

@@ -18,7 +18,7 @@ from experiments.study import identification
 from experiments.study.analysis import delays
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.analysis.identified import list_estimates
-from experiments.study.target_domain import hit_log, joint_log
+from experiments.study.target_domain import lab_logs
 from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.together.hits import SEEN_HIGH
@@ -40,7 +40,7 @@ def task():
 
 
 def swept(task, model: SimModel, seed: int = 0):
-    return joint_log.record(task, without_nominal(model), jax.random.key(seed), 30.0)
+    return lab_logs.record_joints(task, without_nominal(model), jax.random.key(seed), 30.0)
 
 
 def balls(world: World, n: int = 120) -> Dataset:
@@ -56,7 +56,7 @@ def balls(world: World, n: int = 120) -> Dataset:
 
 def test_sweeps_stay_within_the_limits_and_near_home():
     rng, period = np.random.default_rng(1), 1.0 / 75.0
-    actions = joint_log.multisine(rng, 4500, period)
+    actions = lab_logs.multisine(rng, 4500, period)
     assert np.abs(actions).max() <= 1.0 and not actions[:37].any()
     moved = np.cumsum(actions * LIMITS.policy_velocity, axis=0) * period
     home = np.asarray(mjcf.home_qpos(mjcf.load_model()))
@@ -123,7 +123,7 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     player, policy = reality.player("player3"), load_policy.load(QUICKSTART).policy
     measurements.write_csv(tmp_path / "D0.csv", reality.first_balls(player, 300, jax.random.key(0), "D0"))
     identification.write_joints(tmp_path / "joints", swept(reality.simulator.task, reality.known))
-    log = hit_log.record(reality.simulator, reality.known, player, policy, jax.random.key(1), "hits", 0.003, 0.04)
+    log = lab_logs.record_hits(reality.simulator, reality.known, player, policy, jax.random.key(1), "hits", 0.003, 0.04)
     # The clock is one: a ball's track and its joints cover the same time.
     assert all(log.joints[0].state_time[0] < t.time[-1] < log.joints[0].state_time[-1] for t in log.balls)
     identification.write_hits(tmp_path / "hits", log.balls, log.joints)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,10 +32,10 @@ from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.jobs.site import ALONE
 from experiments.runs import load_policy
-from experiments.study import blind_protocol, paths, schedule, session, training
+from experiments.study import blind_protocol, paths, schedule, session
 from experiments.study.analysis import scoring
 from experiments.study.analysis.paper import TEN
-from experiments.study.pipeline import Pipeline
+from experiments.study.pipeline import Pipeline, make_config
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.play_on_robot import make_blind_steps
@@ -218,9 +219,9 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     night = study_config.load(study_config.shipped()["study_night"])
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if isinstance(item, Simulated)}
-    first = training.make_config(night, by_key["is2r-sim1"], "player3/M0", None, 5)
-    later = training.make_config(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
-    oracle = training.make_config(night, by_key["oracle-sim"], "player3/M2", None, 7)
+    first = make_config(night, by_key["is2r-sim1"], "player3/M0", None, 5)
+    later = make_config(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
+    oracle = make_config(night, by_key["oracle-sim"], "player3/M2", None, 7)
     assert first.training.updates + 2 * later.training.updates == oracle.training.updates
     assert (first.initial_policy, later.initial_policy, oracle.initial_policy) == (None, str(tmp_path), None)
     assert (
@@ -244,7 +245,7 @@ def test_the_papers_study_trains_as_the_papers_training():
     ]
     assert study_.simulation.rounds[0].simulated == paper.training.updates
     item = next(i for i in schedule.list_items(study_, "player1") if isinstance(i, Simulated))
-    assert training.make_config(study_, item, "narrow", None, 0).training.later_rewards is None
+    assert make_config(study_, item, "narrow", None, 0).training.later_rewards is None
 
 
 # The hidden reality
@@ -466,19 +467,20 @@ def test_a_study_leaves_what_it_says(finished):
 
 @pytest.mark.slow
 def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
-    """Compilations counted by JAX itself."""
-    compiled = []
+    """Compilations counted by JAX itself; other balls."""
+    steps = {step.name: step for step in Pipeline(study(), tmp_path, quiet()).steps()}
+    step, compiled = steps["seed0/player3/is2r-sim1"], []
+    human = tmp_path / "seed0" / "player3" / "balls" / "human_M0.yaml"
+    human.parent.mkdir(parents=True)
+    shutil.copyfile(finished / "seed0" / "player3" / "balls" / "human_M2.yaml", human)
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None
     )
-    by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
-    human = finished / "seed0" / "player3" / "balls" / "human_M2.yaml"
-    text = training.train_seeds(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
-    assert text.startswith("6 updates")
+    assert step.run().startswith("6 updates")
     assert not compiled
-    places = tmp_path / "again", finished / "seed0" / "player3" / "is2r-sim1"
+    places = step.outputs[0].parent, finished / "seed0" / "player3" / "is2r-sim1"
     one, two = (Policy.load(place / paths.POLICY).theta for place in places)
-    assert np.abs(one - two).max() > 1e-3  # another seed and other balls
+    assert np.abs(one - two).max() > 1e-3  # other balls
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from experiments.config import build
-from experiments.study.target_domain import joint_log
+from experiments.study.target_domain import lab_logs
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.logs import Logs
 from mjx_tt.env.task import Task, TaskConfig
@@ -20,7 +20,7 @@ def swept(robot, values, seconds=20.0):
     """The log of a robot of these drives, and the model that knows nothing of them."""
     nominal = build.nominal_model(robot)
     task = Task(TaskConfig(robot=robot))
-    return joint_log.record(task, models.with_values(nominal, values), jax.random.key(0), seconds), nominal
+    return lab_logs.record_joints(task, models.with_values(nominal, values), jax.random.key(0), seconds), nominal
 
 
 @pytest.mark.parametrize("name", [pytest.param("fr3_pedestal", marks=pytest.mark.slow), "ur10e_rail"])

@@ -84,6 +84,7 @@ def test_a_poor_zero_shot_policy_costs_the_updates_to_an_equal_level(tmp_path):
         (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     assert m.tuning_cost() is None  # one player of one seed has no interval
     shutil.copytree(tmp_path / "seed0", tmp_path / "seed1")
-    second = replace(rallies, seed=np.ones_like(rallies.seed))
+    second = rallies.copy()
+    second.seed = 1
     m = Measurements(replace(m.study, rallies=scoring.join([rallies, second])))
     assert m.tuning_cost().value == pytest.approx(60 / 30)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.study.target_domain.hit_log import AWAY, count_visible
+from experiments.study.target_domain.lab_logs import AWAY, count_visible
 
 RATE = 125.0  # [Hz]
 

@@ -1,14 +1,18 @@
-"""Balls of the virtual reality from the player's paddle to the robot's and back, with the joints on the same clock.
+"""What a laboratory logs of the virtual reality: its joints before the first ball, and balls with hits in them.
 
-Turns of a rally are played, and each is watched: the robot's motion as the simulator of the rallies has it, step by
-step, the ball flown along it once more in finer steps, so that a camera's frame needs no control period. What comes out
-is what a laboratory logs: a tracker's positions when they arrive, encoders' positions when they arrive, each as late as
-that episode's draw of its latency, with the errors of camera and zeros.
+Joints: for a minute each follows a sum of sines of its own, so that its position stays near home while its speed and
+acceleration take many values (multisine: Schoukens and Ljung, IEEE Control Systems 39, 2019).
+
+Hits: balls from the player's paddle to the robot's and back, with the joints on the same clock. Turns of a rally are
+played, and each is watched: the robot's motion as the simulator of the rallies has it, step by step, the ball flown
+along it once more in finer steps, so that a camera's frame needs no control period. A tracker's positions and the
+encoders' come when they arrive, each as late as that episode's draw of its latency, with the errors of camera and
+zeros.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -33,13 +37,89 @@ from mjx_tt.env.task import Task
 from mjx_tt.rally.human_player import Player
 from mjx_tt.rally.simulator import RallySimulator
 from mjx_tt.sim import actuators, latency
+from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import FESTO_JOINTS
+from robot_io.contract import FESTO_JOINTS, LIMITS, JointLimits
 
+REST = 0.5  # [s] before the first motion, in which the joints stand where they are
+SINES = 6
+FREQUENCIES = (0.25, 3.0)  # [Hz]
+REACH = 0.04  # of a joint's range that its position leaves home by, about
 SECONDS = 1.4  # of each ball that are watched
 EVERY = 4.0  # [s] from ball to ball on the log's clock
 SUBSTEPS = 4  # of the ball per camera frame
 AWAY = 0.3  # [m] beyond the player's contact at which a return is out of sight
+RALLIES, TURNS = 12, 10  # side by side, and of each
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sweeps:
+    """Actions by tick as a ``Controller``."""
+
+    actions: Array  # (ticks, n)
+
+    @property
+    def mean(self) -> Array:
+        return jnp.zeros(3 + self.actions.shape[1])
+
+    def start(self, observation: Array) -> tuple:
+        return ()
+
+    def act(self, tick: Tick, state: tuple, observation: Array) -> tuple[Array, tuple]:
+        return jnp.broadcast_to(self.actions[tick][:, None], (self.actions.shape[1], *observation.shape[1:])), ()
+
+
+def multisine(rng: np.random.Generator, ticks: int, period: float, limits: JointLimits = LIMITS) -> np.ndarray:
+    """Actions (ticks, n) in [-1, 1]: derivatives of sums of sines that begin and end softly, after a rest."""
+    time = np.arange(ticks) * period - REST
+    (low, high), n = np.log(FREQUENCIES), len(limits.joints)
+    frequency = np.exp(rng.uniform(low, high, (SINES, n)))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (SINES, n))
+    reach = REACH * (np.asarray(limits.upper) - np.asarray(limits.lower))
+    rate = 2.0 * np.pi * frequency
+    speed = rate * np.cos(rate * time[:, None, None] + phase) / np.maximum(frequency, 1.0)
+    velocity = reach * speed.sum(axis=1) / np.sqrt(SINES)
+    soft = np.clip(time / 0.5, 0.0, 1.0) * np.clip((time[-1] - time) / 0.5, 0.0, 1.0)
+    return np.clip(velocity * soft[:, None] / np.asarray(limits.policy_velocity), -1.0, 1.0)
+
+
+def record_joints(task: Task, model: SimModel, key: PRNGKeyArray, seconds: float = 60.0) -> tuple[JointRecord, ...]:
+    """The log of a robot of that model which was swept for so many seconds, a record for each joint."""
+    ticks, period = round(seconds / task.config.period), task.config.period
+    actions = multisine(np.random.default_rng(int(jax.random.bits(key))), ticks, period, task.contract.limits)
+    commands, positions = _swept(model, Sweeps(jnp.asarray(actions, jnp.float32)), task=task)
+    time = np.arange(ticks) * period
+    numbers = [np.asarray(values, np.float64).T for values in (commands, positions)]
+    return tuple(
+        JointRecord(name, time, command, time, position, task.config.robot)
+        for name, command, position in zip(task.contract.joints, *numbers, strict=True)
+    )
+
+
+@partial(jax.jit, static_argnames="task")
+def _swept(model: SimModel, sweeps: Sweeps, task: Task) -> tuple[Array, Array]:
+    """Commands and measured positions (ticks, n)."""
+    # Over a minute what an episode's latency is off its mean averages out.
+    delays = jnp.stack([jnp.full((1,), getattr(model.latency, name)) for name in models.LATENCIES])
+    still = jnp.zeros((3, 1))
+    episodes = Episodes(
+        ball=BallState(jnp.array([[0.0], [0.0], [1.0]]), still, still),
+        latency=delays,
+        seed=jnp.zeros((1,), jnp.uint32),
+        model=model,
+    )
+    constants = task.prepare(episodes)
+
+    def advance(s: EpisodeState, tick: Tick) -> tuple[EpisodeState, tuple[Array, Array]]:
+        seen = task.observe(tick, s, episodes, constants)
+        s = task.step(tick, s, episodes, constants, sweeps)
+        kept = replace(s, ball=episodes.ball, live=jnp.ones_like(s.live))  # no ball is played
+        return kept, (s.command[:, 0], seen[3:, 0])
+
+    ticks = jnp.arange(sweeps.actions.shape[0])
+    _, found = jax.lax.scan(advance, task.reset(episodes, sweeps), ticks)
+    return found
 
 
 @dataclass(frozen=True)
@@ -50,7 +130,7 @@ class HitLog:
     joints: tuple[JointRecord, ...]
 
 
-def record(
+def record_hits(
     simulator: RallySimulator,
     model: SimModel,
     player: Player,
@@ -59,28 +139,26 @@ def record(
     session: str,
     noise: float,
     believed: float,
-    rallies: int = 12,
-    turns: int = 10,
 ) -> HitLog:
-    """``rallies`` x ``turns`` balls of rallies of a player with a policy, one after the other on the log's clock.
+    """RALLIES x TURNS balls of rallies of a player with a policy, one after the other on the log's clock.
 
     model: the reality, without what is nominal; noise: [m] of the camera; believed: [s] by which the camera is late as
     far as one knows, which its stamps are put right by.
     """
     start_key, play_key, camera_key = jax.random.split(key, 3)
-    policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], rallies, axis=-1), policy)
-    state, task = simulator.start(player, model, start_key, rallies), simulator.task
+    policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], RALLIES, axis=-1), policy)
+    state, task = simulator.start(player, model, start_key, RALLIES), simulator.task
     balls: list[Trajectory] = []
     states: list[_States] = []
-    for turn in range(turns):
+    for turn in range(TURNS):
         turn_key = jax.random.fold_in(play_key, turn)
         episodes = simulator.episodes(turn_key, model, state)
         watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
         state, _ = simulator.shots(policy, player, model, state, turn_key)
         seen = hidden_effects.observe(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
         late_by = np.asarray(episodes.latency)
-        for rally in range(rallies):
-            begin = EVERY * (turn * rallies + rally)
+        for rally in range(RALLIES):
+            begin = EVERY * (turn * RALLIES + rally)
             late = float(late_by[0, rally]) - believed
             count = count_visible(watched[0][..., rally])
             time = begin + late + np.arange(count) / CAMERA_RATE
