@@ -21,9 +21,9 @@ from robot_io.contract import JOINT_NAMES
 from robot_io.control.interfaces import BridgeConfig
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.tracker import TrackerParams
-from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.world import World
 from tests.support.contact_log import made_up
 from tests.support.hidden_rig import HIDDEN, grid, touches
