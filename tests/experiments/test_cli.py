@@ -76,8 +76,8 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
         --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
         study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip;
         log lerobot nowhere --out a; fit-human file --fit nelder-mead --model file --out a.yaml""",
-        2: """trian; train; evaluate . --episodes 0; evaluate . --episodes 2.5; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu;
-        fit-human file --fit simplex --out a.yaml""",
+        2: """trian; train; evaluate . --episodes 0; evaluate . --episodes 2.5; rig --ports 1; log close a.mcap;
+        run . --robot rig --backend tpu; fit-human file --fit simplex --out a.yaml""",
         0: "--version; --help",
     }
     lines = [([command, "--help"], 0) for command in COMMANDS]
