@@ -181,8 +181,9 @@ def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float
 
     def sizes(columns: np.ndarray) -> tuple[float, float]:
         smooth = np.where(np.isin(np.arange(len(found.columns)), columns), left.coefficients, 0.0)
-        beyond = found.model.beyond(found.chosen, smooth)
-        shown = np.tensordot(beyond, found.columns, 1)[None]
+        if found.prior is None:  # beside spins of their own, which take up much, functions count whole
+            smooth = found.model.beyond(found.chosen, smooth)
+        shown = np.tensordot(smooth, found.columns, 1)[None]
         square = (after_starts(shown, found.linear, g).reshape(g.n, 3, -1) ** 2).sum(axis=1)
         return float(np.percentile(np.sqrt(square.max(axis=1)), 90)), float(np.sqrt(square.sum() / g.mask.sum()))
 

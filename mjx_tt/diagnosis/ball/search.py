@@ -133,7 +133,8 @@ def search(
             rows = after_starts(columns, linear, g)
             square = np.einsum("nrc,nrd->cd", rows, rows, optimize=True) / g.mask.sum()
             whole = float(np.max(picked.errors)) - level
-            more = model.catalogued(chosen, picked.left, square, whole, NO_ERROR)
+            # Balls with spins of their own take up much: what is left beside them is no other cause's.
+            more = () if prior is not None else model.catalogued(chosen, picked.left, square, whole, NO_ERROR)
             if not more:
                 break
             held, seen = (*held, *more), set()
