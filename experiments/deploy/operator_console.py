@@ -27,7 +27,8 @@ MOVING = "parc+-"  # keys after which something moves, or may
 ESCAPE = "\x1b"
 # A whole escape sequence (ECMA-48; and a Linux console's function keys, two brackets and one), a string, or Alt.
 SEQUENCE = re.compile(
-    r"\x1b(?:\[(?:\[[^@-~]*|(?!\[)[^@-~]*)[@-~]|O[^@-~]*[@-~]|[]PX^_].*?(?:\a|\x1b\\)|[^][OPX^_\x1b])", re.DOTALL
+    r"(?<!\x1b)\x1b(?:\[(?:\[[^@-~]*|(?!\[)[^@-~]*)[@-~]|O[^@-~]*[@-~]|[]PX^_].*?(?:\a|\x1b\\)|[^][OPX^_\x1b])",
+    re.DOTALL,
 )
 LONGEST_READ = 4096  # bytes; a terminal keeps no more
 
