@@ -24,7 +24,7 @@ from rich.prompt import Prompt
 from ballmodel.constants import BALL_RADIUS, PADDLE_RADIUS, TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.io.atomic_files import replacing
 from experiments.deploy.control_session import ControlSession
-from robot_io.contract import PAPER, Contract
+from robot_io.contract import Contract
 from robot_io.control import messages
 from robot_io.control.config import RobotConfig, axis_range
 from robot_io.control.messages import Message, Status
@@ -51,6 +51,7 @@ STILL = (0.003, 0.01)  # [m] as of the points for a calibration
 CLIPPED = 0.03  # [m] by which the ball on the blade may miss where the joints say that it is
 MOVED = 0.25, 0.004  # share of a motion, and [m], by which it may differ
 STEP = {"m": 0.04, "rad": 0.1}  # of the motions that are compared
+LONGEST_STEP = {"m": 0.02, "rad": 0.05}  # of one request to jog
 SILENCE_ERROR = 0.02  # [s] by which CommTimeout may be measured longer than the gate is told: some packets
 LATE = 0.15  # [s] from a command to its effect as it is measured; the gate allows for 0.2 s
 SPEED = 0.9  # share of the commanded speed that must be reached
@@ -126,7 +127,7 @@ class Record:
 class Commissioning:
     """Steps on one robot: each is a method that returns what it has proven, and raises NotProven.
 
-    begin_play  makes a session that plays balls at ``SCALE``, with a policy; None: there is none
+    begin_play  makes a session that plays a ball at ``SCALE``, with a policy
     """
 
     def __init__(
@@ -135,8 +136,8 @@ class Commissioning:
         operator: Terminal,
         config: RobotConfig,
         record: Record,
-        contract: Contract = PAPER,
-        begin_play: Callable[[], Any] | None = None,
+        contract: Contract,
+        begin_play: Callable[[], str],
     ) -> None:
         self._session, self._operator, self._config, self._record = session, operator, config, record
         self._contract, self._begin_play = contract, begin_play
@@ -312,8 +313,7 @@ class Commissioning:
             before, q = self._ball(name), self._measured()
             self._jog(i, STEP[self._contract.units[i]], SLOW)
             moved = self._ball(name) - before
-            there = q + np.eye(len(q))[i] * STEP[self._contract.units[i]]
-            expected = self._clipped(there) - self._clipped(q)
+            expected = self._clipped(q + STEP[self._contract.units[i]] * self._joint(i)) - self._clipped(q)
             off = float(np.linalg.norm(moved - expected))
             worst = max(worst, off)
             if off > MOVED[0] * np.linalg.norm(expected) + MOVED[1]:
@@ -370,7 +370,8 @@ class Commissioning:
         if error.max() > 0.9 * STEP["rad"] / 2 and error[-1] > 0.9 * STEP["rad"] / 2:
             gain = 0.0
         self._jog(i, -STEP["rad"] / 2, FAST)
-        self._settle()
+        self._session_time(0.5)
+        self._check_fault()
         if not GAIN[0] <= gain <= GAIN[1]:
             raise NotProven(
                 f"position correction: a step of {STEP['rad'] / 2} rad is corrected at {gain:.2f} / s, expected "
@@ -427,8 +428,6 @@ class Commissioning:
 
     def _first_ball(self) -> str:
         self._operator.do("unclip", "take the ball off the blade and leave the robot's reach")
-        if self._begin_play is None:
-            raise NotProven("no policy is given: --artefact")
         return self._begin_play()
 
     # What steps are made of
@@ -506,6 +505,10 @@ class Commissioning:
     def _measured(self) -> np.ndarray:
         return np.array([position for _, _, position, _ in self._last().joints])
 
+    def _joint(self, i: int) -> np.ndarray:
+        """A one for joint i, zeros for the others (n,)."""
+        return np.eye(self._contract.n_joints)[i]
+
     def _clipped(self, q: np.ndarray) -> np.ndarray:
         """Where the ball on the blade is (3,) [m] at joint positions q (n,)."""
         hand = self._geometry.hand(q[:, None])[0]
@@ -527,24 +530,20 @@ class Commissioning:
     def _jog(self, i: int, way: float, share: float, wait: bool = True, pulled: bool = False) -> None:
         """Move a joint by ``way`` in the steps that are allowed, each when the one before has been commanded."""
         unit = self._contract.units[i]
-        steps = max(math.ceil(abs(way) / {"m": 0.02, "rad": 0.05}[unit] - 1e-9), 1)
+        steps = max(math.ceil(abs(way) / LONGEST_STEP[unit] - 1e-9), 1)
         for k in range(1, steps + 1):
-            self._session.send(messages.Jog(tuple(way / steps * np.eye(self._contract.n_joints)[i]), share, pulled))
+            self._session.send(messages.Jog(tuple(way / steps * self._joint(i)), share, pulled))
             if wait or k < steps:
                 self._last()
                 self._until(lambda s: s.joints[i][3] == 0.0 or s.state != "ready", 10.0)
         if wait:
             self._check_fault()
 
-    def _settle(self) -> None:
-        self._session_time(0.5)
-        self._check_fault()
-
     def _rush(self, i: int, seconds: float) -> None:
         """Move a joint away from the nearer end of its range at 10 % speed."""
         limits, unit = self._contract.limits, self._contract.units[i]
         way = 1.0 if self._measured()[i] < 0.5 * (limits.lower[i] + limits.upper[i]) else -1.0
-        step = tuple(way * {"m": 0.02, "rad": 0.05}[unit] * np.eye(self._contract.n_joints)[i])
+        step = tuple(way * LONGEST_STEP[unit] * self._joint(i))
         for _ in range(round(seconds / 0.02)):
             self._session.send(messages.Jog(step, FAST))
             self._session_time(0.02)
@@ -561,7 +560,7 @@ class Commissioning:
         if length < 0.2 * size:
             return f"it does not move: {seen}"
         for j, name in enumerate(joints):
-            other = self._clipped(q + np.eye(len(q))[j] * STEP[self._contract.units[j]]) - self._clipped(q)
+            other = self._clipped(q + STEP[self._contract.units[j]] * self._joint(j)) - self._clipped(q)
             if j != i and np.linalg.norm(moved - other) < MOVED[0] * np.linalg.norm(other) + MOVED[1]:
                 return f"{name} moved instead: are they swapped? {seen}"
         cosine = float(moved @ expected) / (size * length)

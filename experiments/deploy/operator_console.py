@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import select
 import sys
 import termios
@@ -24,6 +25,11 @@ QUIT, PAUSE, RECOVER = "q", "h", "c"
 STOP = " "
 MOVING = "parc+-"  # keys after which something moves, or may
 ESCAPE = "\x1b"
+# A whole escape sequence (ECMA-48; and a Linux console's function keys, two brackets and one), a string, or Alt.
+SEQUENCE = re.compile(
+    r"(?<!\x1b)\x1b(?:\[(?:\[[^@-~]*|(?!\[)[^@-~]*)[@-~]|O[^@-~]*[@-~]|[]PX^_].*?(?:\a|\x1b\\)|[^][OPX^_\x1b])",
+    re.DOTALL,
+)
 LONGEST_READ = 4096  # bytes; a terminal keeps no more
 
 
@@ -57,35 +63,17 @@ class EscapeFilter:
     BROKEN_OFF = 0.5  # [s]; a terminal sends a sequence at once
 
     def __init__(self) -> None:
-        self._inside = ""  # what has come of a sequence that has not ended
+        self._rest = ""  # what has come of a sequence that has not ended
         self._last = -math.inf
 
     def keys(self, text: str, now: float) -> str:
         """The characters of a piece, read at ``now`` [s], that belong to no sequence."""
         if now - self._last > self.BROKEN_OFF:
-            self._inside = ""
+            self._rest = ""
         self._last = now
-        found = []
-        for character in text:
-            if self._inside or character == ESCAPE:
-                self._inside += character
-                if _ended(self._inside):
-                    self._inside = ""
-            else:
-                found.append(character)
-        return "".join(found)
-
-
-def _ended(sequence: str) -> bool:
-    """True when an escape sequence is complete (ECMA-48; and a Linux console's function keys, two brackets and one)."""
-    if len(sequence) < 2:
-        return False
-    kind, last = sequence[1], sequence[-1]
-    if kind in "[O":
-        return len(sequence) > 2 and "@" <= last <= "~" and sequence != "\x1b[["
-    if kind in "]PX^_":  # strings
-        return last == "\a" or sequence.endswith("\x1b\\")
-    return kind != ESCAPE
+        keys, escape, rest = SEQUENCE.sub("", self._rest + text).partition(ESCAPE)
+        self._rest = escape + rest
+        return keys
 
 
 class Keyboard:
@@ -171,14 +159,10 @@ class View:
         ball = "no ball" if s.ball is None else "ball {:+.3f} {:+.3f} {:+.3f} m in the table frame".format(*s.ball)
         clock = f"tracker's clock {-1e6 * s.clock['drift']:+z.1f} ppm over {s.clock['seconds']} s" if s.clock else ""
         lines.append(Text(f"{ball}; {clock}"))
-        joints = Table(box=None, pad_edge=False)
-        for name in ("joint", "position", "command"):
-            joints.add_column(name, justify="left" if name == "joint" else "right")
+        joints = _table("joint", "position", "command")
         for name, unit, position, velocity in s.joints:
             joints.add_row(name, f"{position:+.3f} {unit}", f"{velocity:+.2f} {unit}/s")
-        timing = Table(box=None, pad_edge=False)
-        for name in ("", "p50", "p99", "max [ms]"):
-            timing.add_column(name, justify="left" if not name else "right")
+        timing = _table("", "p50", "p99", "max [ms]")
         for name, t in s.timings.items():
             if isinstance(t, dict):
                 timing.add_row(name, f"{t['p50_ms']:.3f}", f"{t['p99_ms']:.3f}", f"{t['max_ms']:.3f}")
@@ -194,3 +178,10 @@ class View:
         grid.add_row(joints, timing)
         keys = "   ".join(f"[{'space' if k == ' ' else k}] {key.text}" for k, key in self._keys.items())
         return Group(*lines, grid, wire, Text(keys, "dim"), Text(self._last, "yellow"))
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table(first, box=None, pad_edge=False)
+    for name in others:
+        table.add_column(name, justify="right")
+    return table

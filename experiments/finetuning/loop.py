@@ -41,7 +41,6 @@ from experiments.runs.run_dir import CONFIG, Run
 from experiments.training import finalize
 from experiments.training.update import TrainState
 from mjx_tt.env import task
-from mjx_tt.env.network import Network
 from mjx_tt.env.reward_weights import MEASURED_WEIGHTS
 from mjx_tt.env.terms import PlayedBall as RewardedBall
 from robot_io.contract import JOINT_NAMES
@@ -78,23 +77,15 @@ def finetune(
     at the terminal, and what the robot raises.
     """
     experiment = experiment or experiment_of(source)
-    theta, statistics = load_policy.load_statistics(source)
-    network = load_policy.load(source).policy.network
-    first = TrainState(
-        strategy.init(theta.astype(np.float32), build.bgs_config(settings.optimiser(), settings.updates)),
-        statistics,
-        build.key(settings.seed, build.INITIAL_STATE),
-    )
     run.folder.mkdir(parents=True, exist_ok=True)
     with run.locked():
-        _open(run, experiment, settings, robot, first, str(source))
-        tuning = FineTuningRun(settings, run, robot, operator or Operator(), console, first, network)
+        tuning = FineTuningRun(str(source), experiment, settings, run, robot, operator or Operator(), console)
         with closing(tuning.log), run_dir.continuable(run.folder, "every episode before", "it"):
             finished = tuning.run()
-        if not finished:
-            console.print(f"{run.folder}: stopped; the same command continues it")
-            return None
-        return conclude(experiment, settings, run, robot, console, tuning.journal.entries)
+        if finished:
+            return tuning.conclude()
+    console.print(f"{run.folder}: stopped; the same command continues it")
+    return None
 
 
 def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
@@ -149,18 +140,24 @@ class FineTuningRun:
 
     def __init__(
         self,
+        source: str,
+        experiment: Experiment,
         settings: FineTuning,
         run: Run,
         robot: Robot,
         operator: Operator,
         console: Console,
-        first: TrainState,
-        network: Network,
     ) -> None:
-        self._network = jax_policy.exported(network)
-        self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
+        self._experiment, self._settings, self._run, self._robot = experiment, settings, run, robot
+        self._operator, self._console = operator, console
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
         self._weights = {term.name: term.weight for term in build.reward_terms(settings.rewards)}
+        network = load_policy.load(source).policy.network
+        self._network = None if network is None else jax_policy.exported(network)
+        theta, statistics = load_policy.load_statistics(source)
+        initial = strategy.init(theta.astype(np.float32), self._bgs)
+        first = TrainState(initial, statistics, build.key(settings.seed, build.INITIAL_STATE))
+        self._open(source, first)
         found = checkpoint.load_latest(run.checkpoints, first)
         self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
         self.update, self._seconds = notes["update"], notes["seconds"]
@@ -289,62 +286,61 @@ class FineTuningRun:
             self._progress.played(entry)
         return True
 
+    def conclude(self) -> dict[str, Any]:
+        """Evaluation, picture, the human's balls and the artefact of a fine-tuning that is over; returns the report."""
+        run, settings, entries = self._run, self._settings, self.journal.entries
+        result = report.compare(entries, self._robot.repeatable)
+        result |= {"settings": settings.model_dump(mode="json"), "robot": self._robot.describe()}
+        kept = [entry for entry in entries if not entry.discarded]
+        title, rows = f"{run.folder.name}: fine-tuning on a robot", metrics.read(run.metrics)
+        picture = report.draw(run.plots / CURVE, rows, settings.episodes_per_update, result, title)
+        # Balls that a repeatable robot meets before and after are the same.
+        human = [entry for entry in kept if entry.phase != AFTER or not self._robot.repeatable]
+        balls = report.write_human_balls(run.folder / HUMAN_BALLS, run.folder.name, human)
+        tuned = load_policy.load(run.folder)
+        exported = finalize.export_policy(run.artefact, tuned, self._experiment, result, self._console)
+        run_dir.write_json(run.evaluation, result)
+        report.print_result(self._console, result, str(run.folder))
+        files = {
+            "evaluation": run.evaluation,
+            "curve": picture,
+            "balls": f"{run.folder / HUMAN_BALLS} ({balls:,}; mjx-tt fit-human makes a distribution of them)",
+            "artefact": run.artefact if exported else None,
+        }
+        print_files(self._console, files)
+        return result
 
-def conclude(
-    experiment: Experiment, settings: FineTuning, run: Run, robot: Robot, console: Console, entries: list[Entry]
-) -> dict[str, Any]:
-    """Evaluation, picture, the human's balls and the artefact of a fine-tuning that is over; returns the report."""
-    result = report.compare(entries, robot.repeatable)
-    result |= {"settings": settings.model_dump(mode="json"), "robot": robot.describe()}
-    kept = [entry for entry in entries if not entry.discarded]
-    title, rows = f"{run.folder.name}: fine-tuning on a robot", metrics.read(run.metrics)
-    picture = report.draw(run.plots / CURVE, rows, settings.episodes_per_update, result, title)
-    # Balls that a repeatable robot meets before and after are the same.
-    human = [entry for entry in kept if entry.phase != AFTER or not robot.repeatable]
-    balls = report.write_human_balls(run.folder / HUMAN_BALLS, run.folder.name, human)
-    exported = finalize.export_policy(run.artefact, load_policy.load(run.folder), experiment, result, console)
-    run_dir.write_json(run.evaluation, result)
-    report.print_result(console, result, str(run.folder))
-    files = {
-        "evaluation": run.evaluation,
-        "curve": picture,
-        "balls": f"{run.folder / HUMAN_BALLS} ({balls:,}; mjx-tt fit-human makes a distribution of them)",
-        "artefact": run.artefact if exported else None,
-    }
-    print_files(console, files)
-    return result
+    def _open(self, source: str, first: TrainState) -> None:
+        """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
 
-
-def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str) -> None:
-    """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
-
-    Before the first ball there is nothing to protect: a failed start must not stand in the way of the corrected one.
-    """
-    path, journal = run.folder / SETTINGS, run.folder / JOURNAL
-    arrays = (first.bgs.theta, *normalizer.normaliser(first.statistics))
-    wanted = {
-        "source": source,
-        "policy": hashlib.sha256(b"".join(np.asarray(a, np.float32).tobytes() for a in arrays)).hexdigest(),
-        "robot": robot.describe(),
-        "settings": settings.model_dump(mode="json"),
-    }
-    if path.exists() and journal.exists() and journal.stat().st_size > 0:
-        found = read_yaml(path.read_text(encoding="utf-8"), str(path))
-        # A run that an earlier version began has the defaults of keys that came later.
-        found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
-        longer = {"settings.updates"} if settings.step.schedule.kind == "constant" else set()
-        changeable = longer | {"source"}  # the policy itself is compared
-        if changed := run_dir.differences(found, wanted, changeable.__contains__):
-            raise RunError(
-                f"{run.folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out"
-            )
-    elif not path.exists() and (run.folder / CONFIG).exists():
-        raise RunError(f"{run.folder}: is a run of another kind; choose another --out")
-    config = experiment.config.model_copy(
-        update={"name": run.folder.name, "initial_policy": str(Path(source).resolve())}
-    )
-    for target, data in ((path, wanted), (run.folder / CONFIG, config.to_dict())):
-        with replacing(target) as temporary, open(temporary, "w", encoding="utf-8") as file:
-            yaml.safe_dump(data, file, sort_keys=False)
-            file.flush()
-            os.fsync(file.fileno())
+        Before the first ball there is nothing to protect: a failed start must not stand in a corrected one's way.
+        """
+        folder, settings = self._run.folder, self._settings
+        path, journal = folder / SETTINGS, folder / JOURNAL
+        arrays = (first.bgs.theta, *normalizer.normaliser(first.statistics))
+        wanted = {
+            "source": source,
+            "policy": hashlib.sha256(b"".join(np.asarray(a, np.float32).tobytes() for a in arrays)).hexdigest(),
+            "robot": self._robot.describe(),
+            "settings": settings.model_dump(mode="json"),
+        }
+        if path.exists() and journal.exists() and journal.stat().st_size > 0:
+            found = read_yaml(path.read_text(encoding="utf-8"), str(path))
+            # A run that an earlier version began has the defaults of keys that came later.
+            found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
+            longer = {"settings.updates"} if settings.step.schedule.kind == "constant" else set()
+            changeable = longer | {"source"}  # the policy itself is compared
+            if changed := run_dir.differences(found, wanted, changeable.__contains__):
+                raise RunError(
+                    f"{folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out"
+                )
+        elif not path.exists() and (folder / CONFIG).exists():
+            raise RunError(f"{folder}: is a run of another kind; choose another --out")
+        config = self._experiment.config.model_copy(
+            update={"name": folder.name, "initial_policy": str(Path(source).resolve())}
+        )
+        for target, data in ((path, wanted), (folder / CONFIG, config.to_dict())):
+            with replacing(target) as temporary, open(temporary, "w", encoding="utf-8") as file:
+                yaml.safe_dump(data, file, sort_keys=False)
+                file.flush()
+                os.fsync(file.fileno())

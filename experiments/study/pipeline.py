@@ -205,7 +205,7 @@ class Pipeline:
 
         def run() -> str:
             source = None if item.source is None else self.paths.run(seed, player, item.source)
-            score = self._worlds[seed].score(player, name)
+            score = self._worlds[seed].score(player, name) if self.study.simulation.seeds > 1 else None
             balls = item.balls if human is None else load_distribution(human).to_dict()
             scores: dict[str, float] = {}
             for k in range(self.study.simulation.seeds):

@@ -139,22 +139,12 @@ def do_steps(study: Study, folder: Path, steps: list[Step], console: Console, wo
             ended(step.name, perform(step))
     elif left:
         setup = Setup("experiments.study.session:prepare", (study, folder))
-        engine.run(workers.engine(setup, folder), jobs(left), lambda job, result: ended(job.name, result))
-
-
-def jobs(steps: list[Step]) -> list[Job]:
-    """The steps, each after those that make its inputs; a round's trainings share a program."""
-    makers = {path: step.name for step in steps for path in step.outputs}
-    return [
-        Job(
-            step.name,
-            (step.name,),
-            frozenset(makers[path] for path in step.inputs if path in makers),
-            step.program,
-            step.compiled,
-        )
-        for step in steps
-    ]
+        makers = {path: step.name for step in left for path in step.outputs}
+        jobs = []
+        for step in left:  # each after those that make its inputs; a round's trainings share a program
+            needed = frozenset(makers[path] for path in step.inputs if path in makers)
+            jobs.append(Job(step.name, (step.name,), needed, step.program, step.compiled))
+        engine.run(workers.engine(setup, folder), jobs, lambda job, result: ended(job.name, result))
 
 
 def prepare(study: Study, folder: Path) -> Callable[[str], tuple[str, float]]:

@@ -84,11 +84,11 @@ class RobotWorld:
     def first_balls(self, player: str, name: str) -> Dataset:
         """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
         serves. Raises ConfigError as ``load_recording`` does."""
+        label = Path(name).name
         if player not in self._study.recordings:
-            return serve_balls(player, self._study.first_balls, derive_seed(name), name.rsplit("/", 1)[-1])
+            return serve_balls(player, self._study.first_balls, derive_seed(name), label)
         measured = load_recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
-        label = name.rsplit("/", 1)[-1]
         tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
         return Dataset(tracks, self._study.recording(player))
 
@@ -126,13 +126,11 @@ class RobotWorld:
         tracks = tuple(replace(t, session=name, name=str(i)) for i, t in enumerate(kept))
         return HitLog(Dataset(tracks, name), tuple(r.between(begin, end) for r in joints))
 
-    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
-        """Function that scores a policy on the robot; None where scores are not needed."""
-        simulation, seed = self._study.simulation, derive_seed(name)
-        if simulation.seeds == 1:
-            return None
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float]:
+        """Function that scores a policy on the robot."""
+        balls, seed = self._study.simulation.selection_episodes, derive_seed(name)
         self._console.print(f"{name}: {player} to the table", highlight=False)
-        return lambda p: score(p, self._robot, simulation.selection_episodes, seed, self._console)
+        return lambda p: score(p, self._robot, balls, seed, self._console)
 
 
 class StandStill:

@@ -307,10 +307,8 @@ class VirtualWorld:
         text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {np.mean(rates):.0%}"
         return Dataset(cycle.balls, name), text
 
-    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
-        """Function that scores a policy with the player; None where scores are not needed."""
-        if self._study.simulation.seeds == 1:
-            return None
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float]:
+        """Function that scores a policy with the player."""
         person, balls, key = self.reality.player(player), self._study.simulation.selection_episodes, self._key(name)
         return lambda p: self.reality.score(person, p.policy, balls, key)
 

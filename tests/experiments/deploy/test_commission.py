@@ -88,7 +88,7 @@ def commissioning(tmp_path, params=RIG, done=(), **answers):
         record.add(step, "as before")
     session = LockStepSession(params)
     person = Person(LockStepHands(session.rig), **answers)
-    made = Commissioning(session, person, RobotConfig(), record, begin_play=lambda: "the first ball was played")
+    made = Commissioning(session, person, RobotConfig(), record, PAPER, lambda: "the first ball was played")
     return made, session, person
 
 

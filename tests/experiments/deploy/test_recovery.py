@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
-from experiments.deploy.recovery import LONGEST, Recovery
-from robot_io.control.messages import Arm, FaultReport, Prepare, Refused, Reset, Status
+from experiments.deploy.recovery import LONGEST, Controls, Recovery
+from robot_io.control.messages import Arm, Discard, FaultReport, Prepare, Refused, Reset, Status
 from robot_io.errors import RefusedError
 
 FAULT = FaultReport("stale_arm", "nothing heard")
@@ -151,3 +152,24 @@ def test_what_passes_by_itself_is_waited_for():
     sent = steps(recovery, status(**stop), status(), ramps, ramps)
     assert sent == [Prepare(), Reset(), None, None] and not recovery.done
     assert recovery.step(status("disarmed"), 1.0) is None and recovery.message == "all is well: press a to arm"
+
+
+def test_the_key_begins_it_and_the_next_key_or_a_refusal_ends_it():
+    sent, said, keys = [], [], ["c", "d", "c", None]
+    session, view = (
+        SimpleNamespace(status=status(), send=sent.append),
+        SimpleNamespace(say=said.append, take=said.append),
+    )
+    controls = Controls(session, SimpleNamespace(pressed=lambda: keys.pop(0)), view, emulated=False)
+    assert controls.pressed() == "c" and not sent
+    controls.take(status())
+    controls.take(Refused(Prepare(), RefusedError("an axis does not answer yet")))
+    controls.take(status())
+    assert sent == [Prepare(), Reset()]
+    assert controls.pressed() == "d"
+    controls.take(status("disarmed"))
+    assert sent[2:] == [Discard()]
+    assert controls.pressed() == "c" and controls.pressed() is None
+    for message in (status(), status(), status("disarmed"), status("disarmed")):
+        controls.take(message)
+    assert sent[3:] == [Prepare(), Reset(), Arm()]

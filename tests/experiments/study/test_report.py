@@ -5,7 +5,11 @@ from __future__ import annotations
 import base64
 import csv
 import io
+import json
+import math
 import re
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,8 +23,9 @@ from experiments.errors import ConfigError
 from experiments.study.analysis import claims, scoring, statistics
 from experiments.study.analysis import paper as study_paper
 from experiments.study.analysis import study_folder as study_data
-from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
+from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, Measurements, judge
 from experiments.study.analysis.statistics import Bootstrap, Interval
+from experiments.study.analysis.study_folder import StudyFolder
 from experiments.study.report import figures
 from mjx_tt.rally.end_reasons import End
 from tests.support import made_up_study
@@ -31,6 +36,11 @@ def rallies(lengths: dict, end=End.ROBOT_MISSED):
     return scoring.join(
         scoring.score_rallies(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
     )
+
+
+def played(lengths: dict) -> scoring.Rallies:
+    """Own rallies of player 3, {model: lengths}."""
+    return rallies({(0, "player3", "player3", model): values for model, values in lengths.items()})
 
 
 # Statistics
@@ -132,6 +142,77 @@ def test_normalisation_both_ways_by_hand():
         assert by_model[where] == pytest.approx(values)
 
 
+# Changes of the human models, and costs
+
+BEGINNERS, INTERMEDIATE = ("player3", "player5"), ("player2", "player4")
+
+
+def measured(tmp_path, second: dict[tuple[int, str], float]) -> Measurements:
+    """Of a study whose first changes are all 1, with these second ones by seed and player."""
+    found = Measurements(StudyFolder(tmp_path, {}, scoring.join([])))
+    found.changes = {at: (1.0, change) for at, change in second.items()}
+    return found
+
+
+def test_changes_of_several_seeds_have_intervals_over_seeds(tmp_path):
+    by_seed = {0: 0.1, 1: 0.2, 2: 0.15}
+    second = {
+        (s, p): x * (2.0 if p in BEGINNERS else 1.0) for s, x in by_seed.items() for p in BEGINNERS + INTERMEDIATE
+    }
+    m, logs = measured(tmp_path, second), np.log([*by_seed.values()])
+    half = stats.t.ppf(0.975, 2) * logs.std(ddof=1) / math.sqrt(3)
+    found = m.model_change()
+    assert found.value == pytest.approx(math.sqrt(2.0) * math.exp(logs.mean())) and found.n == 3
+    assert found.high / found.value == pytest.approx(math.exp(half)) and not found.over
+    levels = m.model_change_by_level()
+    assert (levels.value, levels.low, levels.high) == pytest.approx((2.0, 2.0, 2.0))  # the seeds' part cancels
+
+
+def test_changes_of_one_seed_are_over_its_players_and_say_so(tmp_path):
+    m = measured(tmp_path, {(0, "player3"): 0.1, (0, "player5"): 0.2, (0, "player2"): 0.1, (0, "player4"): 0.1})
+    expected = stats.ttest_1samp(np.log([0.1, 0.2, 0.1, 0.1]), 0.0).confidence_interval()
+    found = m.model_change()
+    assert (found.low, found.high) == pytest.approx(tuple(np.exp(expected)))
+    assert "players of one seed" in found.over and "players of one seed" in m.model_change_by_level().over
+    whys = {key: found.why for key, found in m.findings.items()}
+    assert "over the players of one seed alone" in whys["model-change"]
+    assert measured(tmp_path, {(0, "player3"): 0.1}).model_change() is None
+
+
+def test_a_group_has_the_changes_of_its_players_alone(tmp_path):
+    m = measured(tmp_path, {(s, p): 0.2 if p in BEGINNERS else 0.6 for s in (0, 1) for p in BEGINNERS + INTERMEDIATE})
+    assert m.model_change(group="beginner").value == pytest.approx(0.2)
+    assert m.model_change(group="intermediate").value == pytest.approx(0.6)
+    assert m.findings["change-beginner"].paper == pytest.approx(
+        math.sqrt(math.prod(b / a for a, b in map(claims.paper_changes, BEGINNERS)))
+    )
+
+
+def test_the_longest_rally_is_of_all_that_count(tmp_path):
+    counted = played({"is2r-ft100": [3] * 99 + [151], "s2r-ft100": [400] * 100})
+    found = Measurements(StudyFolder(tmp_path, {}, counted)).longest_rally("is2r-ft100")
+    assert found.value == 151
+    # One rally of a hundred is drawn again with probability 1 - 0.99^100.
+    assert np.mean(found.draws == 151) == pytest.approx(1.0 - 0.99**100, abs=0.04)
+
+
+def test_a_poor_zero_shot_policy_costs_the_updates_to_an_equal_level(tmp_path):
+    """Two fine-tunings that rise alike, from 0.1 and from 0.4: to 0.645, the average that both reach."""
+    found = played({"is2r-sim1": [2] * 60, "oracle-sim": [8] * 60})
+    m = Measurements(StudyFolder(tmp_path, {}, found))
+    for model, start in (("is2r-ft35", 0.1), ("oracle-ft", 0.4)):
+        folder = m.study.paths.model(0, "player3", model)
+        folder.mkdir(parents=True)
+        rows = ({"update": k + 1, "return_rate": start + 0.01 * k} for k in range(60))
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert m.tuning_cost() is None  # one player of one seed has no interval
+    shutil.copytree(tmp_path / "seed0", tmp_path / "seed1")
+    second = found.copy()
+    second.seed = 1
+    m = Measurements(replace(m.study, rallies=scoring.join([found, second])))
+    assert m.tuning_cost().value == pytest.approx(60 / 30)
+
+
 # Verdicts
 
 
@@ -183,7 +264,7 @@ def whole(tmp_path_factory):
 
 def test_measured_means_are_the_known_ones(whole):
     study = study_data.load(whole)
-    m, counted = claims.Measurements(study), Bootstrap(study.pick(own=None, selected=False))
+    m, counted = Measurements(study), Bootstrap(study.pick(own=None, selected=False))
     for model in study_paper.TEN:
         for player in ("player3", "player1"):
             known, found = made_up_study.mean_length(player, model), counted.mean(model, [player])
@@ -196,7 +277,7 @@ def test_measured_means_are_the_known_ones(whole):
 
 
 def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
-    found = claims.Measurements(study_data.load(whole)).findings
+    found = Measurements(study_data.load(whole)).findings
     assert set(found) == {claim.key for claim in study_paper.CLAIMS}
     for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
         assert found[key].verdict.startswith("agrees"), (key, found[key])
@@ -237,7 +318,7 @@ def test_identified_worlds_stand_beside_the_opened_reality(whole):
     assert counted["different intervals of 90 % that hold the truth"] == "2 of 4"  # of two seeds, both players alike
     assert counted["decided by"] == "prior"
     assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
-    m = claims.Measurements(study_data.load(whole))
+    m = Measurements(study_data.load(whole))
     ratio, known = m.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
     assert ratio.low < known < ratio.high
 
@@ -268,7 +349,7 @@ def test_a_study_of_chosen_methods_is_whole_and_says_what_identification_brings(
     (tmp_path / "study.yaml").write_text(settings)
     study = study_data.load(tmp_path)
     assert [line for line in study.missing if "human model" not in line] == []
-    m = claims.Measurements(study)
+    m = Measurements(study)
     for key, ratio in (("identified-zero-shot", 4.5), ("identified-tuned", 2.5)):
         found = m.findings[key].interval
         assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
