@@ -1,5 +1,7 @@
 """Pictures and videos of the table, the robot, the ball and the person's place, made without a display.
 
+A line of text below says which ball it is, what became of it, how fast it was.
+
 Ball and trail are two colours, bright within dark, so that one of them stands out from whatever lies behind: both
 rubbers, table, net, floor, sky. The ball is drawn larger than it is.
 """
@@ -16,11 +18,10 @@ from typing import Any
 import imageio_ffmpeg
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.robot.mjcf import load_model
-from mjx_tt.viz.caption import Caption
 from mjx_tt.viz.opengl import offscreen
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -38,7 +39,44 @@ _GIF_TICK = 0.01  # [s], the format's unit of time
 _GIF_MIN_DELAY = 0.02  # [s], viewers slow down frames that are shorter than this
 _GIF_COLOURS = 128
 
+CAPTION_HEIGHT = 1 / 13  # of the picture's
+BACKGROUND, PLAIN, FAINT = (20, 24, 32), (255, 255, 255), (176, 186, 200)
+GOOD, POOR = (122, 222, 142), (255, 160, 122)
+
+Colour = tuple[float, float, float]
 NO_PATH = np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class Caption:
+    """Text from the left: ``title``, ``text`` in ``colour`` (RGB, 0 to 255); ``note`` at the right end."""
+
+    title: str
+    text: str = ""
+    note: str = ""
+    colour: tuple[int, int, int] = PLAIN
+
+    def written_on(self, frame: np.ndarray) -> np.ndarray:
+        """Copy of a picture (height, width, 3) uint8 with the text over its lowest thirteenth."""
+        image = Image.fromarray(frame)
+        bar = max(1, round(image.height * CAPTION_HEIGHT))
+        top, gap = image.height - bar, 0.45 * bar
+        pen = ImageDraw.Draw(image)
+        pen.rectangle((0, top, image.width, image.height), fill=BACKGROUND)
+        parts = ((self.title, PLAIN), (self.text, self.colour), (self.note, FAINT))
+        font = ImageFont.load_default(0.55 * bar)
+        widths = [pen.textlength(text, font) for text, _ in parts]
+        room = image.width - gap * (1 + sum(bool(text) for text, _ in parts))
+        if sum(widths) > room:  # all of it, in a smaller size
+            font = ImageFont.load_default(0.55 * bar * room / sum(widths))
+            widths = [pen.textlength(text, font) for text, _ in parts]
+        x = gap
+        for (text, colour), width in zip(parts[:2], widths[:2], strict=True):
+            if text:
+                pen.text((x, top + bar / 2), text, colour, font, anchor="lm")
+                x += width + gap
+        pen.text((image.width - gap, top + bar / 2), self.note, FAINT, font, anchor="rm")
+        return np.asarray(image)
 
 
 @dataclass(frozen=True)
@@ -195,8 +233,7 @@ def _add_ball(scene: mujoco.MjvScene, eye: np.ndarray, moment: Moment) -> None:
         _add_disc(scene, eye, _behind(eye, dot), _DOT_RADIUS + EDGE, DARK)
     if np.isfinite(moment.ball).all():
         _add_disc(scene, eye, moment.ball, RING_RADIUS, DARK)
-        sphere = np.full(3, SHOWN_RADIUS)
-        ball = _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, sphere, moment.ball, np.eye(3), BRIGHT)
+        ball = _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, [SHOWN_RADIUS] * 3, moment.ball, np.eye(3), BRIGHT)
         ball.category = mujoco.mjtCatBit.mjCAT_DYNAMIC  # casts a shadow
 
 
@@ -209,41 +246,34 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-def _add_disc(
-    scene: mujoco.MjvScene, eye: np.ndarray, place: np.ndarray, radius: float, rgb: tuple[float, float, float]
-) -> None:
+def _add_disc(scene: mujoco.MjvScene, eye: np.ndarray, place: np.ndarray, radius: float, rgb: Colour) -> None:
     towards = _unit(eye - place)
     across = _unit(np.cross(towards, [0.0, 0.0, 1.0]))
     frame = np.stack([across, np.cross(towards, across), towards], axis=1)
-    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([radius, _FLAT, 0.0]), place, frame, rgb)
+    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, _FLAT, 0.0), place, frame, rgb)
 
 
 def _add_ribbon(
-    scene: mujoco.MjvScene,
-    eye: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    half_width: float,
-    rgb: tuple[float, float, float],
+    scene: mujoco.MjvScene, eye: np.ndarray, start: np.ndarray, end: np.ndarray, half_width: float, rgb: Colour
 ) -> None:
     middle, along = 0.5 * (start + end), _unit(end - start)
     across = _unit(np.cross(along, eye - middle))
     frame = np.stack([along, across, np.cross(along, across)], axis=1)
     length = 0.5 * float(np.linalg.norm(end - start)) + 0.5 * half_width  # no gaps where the path bends
-    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, np.array([length, half_width, _FLAT]), middle, frame, rgb)
+    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, (length, half_width, _FLAT), middle, frame, rgb)
 
 
 def _add(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
-    size: np.ndarray,
+    size: Sequence[float],
     place: np.ndarray,
     frame: np.ndarray,
-    rgb: tuple[float, float, float],
+    rgb: Colour,
 ) -> mujoco.MjvGeom:
     """Appends a geom that shines in its colour whatever the light, and casts no shadow."""
     geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, size, place, frame.ravel(), np.array([*rgb, 1.0], np.float32))
+    mujoco.mjv_initGeom(geom, kind, np.array(size), place, frame.ravel(), np.array([*rgb, 1.0], np.float32))
     geom.category, geom.emission, geom.specular = mujoco.mjtCatBit.mjCAT_DECOR, 0.8, 0.0
     scene.ngeom += 1
     return geom

@@ -1,7 +1,5 @@
 """Frames against closed forms: where the streak is, how long, how much noise; and what is still stays as it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from experiments.vision import render
 from robot_io.vision import rig
-from robot_io.vision.detection import Detection
 from robot_io.vision.health import Health
+from robot_io.vision.triangulation import Detection
 
 RIG = rig.standard()
 PERIOD = 1.0 / RIG.rate
