@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from experiments.vision import network
 from experiments.vision.crops import Crops, draw_shots
@@ -114,17 +115,12 @@ def train(
 
 def save(path: str | Path, params: Any) -> None:
     """Writes parameters to an NPZ."""
-    flat = jax.tree_util.tree_leaves_with_path(params)
-    np.savez(path, **{"/".join(k.key for k in keys): np.asarray(value) for keys, value in flat})  # type: ignore[arg-type]
+    np.savez(path, **flatten_dict(params, sep="/"))
 
 
 def load(path: str | Path) -> Any:
     """Parameters of an NPZ that ``save`` wrote."""
-    params: dict[str, Any] = {}
-    for name, value in np.load(path).items():
-        layer, leaf = name.split("/")
-        params.setdefault(layer, {})[leaf] = value
-    return params
+    return unflatten_dict(dict(np.load(path)), sep="/")
 
 
 def collect_places(count: int, tracks: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

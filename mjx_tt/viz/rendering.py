@@ -4,14 +4,22 @@ A line of text below says which ball it is, what became of it, how fast it was.
 
 Ball and trail are two colours, bright within dark, so that one of them stands out from whatever lies behind: both
 rubbers, table, net, floor, sky. The ball is drawn larger than it is.
+
+OpenGL's back end is the one that MUJOCO_GL names (egl, osmesa, glfw or cgl), or else the first that works of those
+usual on this system. It is chosen when the first picture is made, so it does not matter when MuJoCo was imported.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
+import platform
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +30,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.robot.mjcf import load_model
-from mjx_tt.viz.opengl import offscreen
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
 CAMERA = "human"
@@ -42,6 +49,13 @@ _GIF_COLOURS = 128
 CAPTION_HEIGHT = 1 / 13  # of the picture's
 BACKGROUND, PLAIN, FAINT = (20, 24, 32), (255, 255, 255), (176, 186, 200)
 GOOD, POOR = (122, 222, 142), (255, 160, 122)
+
+_BACKENDS = {"Linux": ("egl", "osmesa"), "Darwin": ("cgl",), "Windows": ("glfw",)}
+_KNOWN_BACKENDS = ("egl", "osmesa", "glfw", "cgl")
+_NO_BACKEND = (
+    "no OpenGL back end for rendering without a display: tried {}. On Debian or Ubuntu install EGL (apt-get install "
+    "libegl1 libgl1 libgl1-mesa-dri) or OSMesa (apt-get install libosmesa6)"
+)
 
 Colour = tuple[float, float, float]
 NO_PATH = np.empty((0, 3))
@@ -185,6 +199,43 @@ def render_frames(
             mujoco.mjr_readPixels(pixels, None, viewport, context)
             frame = pixels[::-1].copy()
             yield frame if moment.caption is None else moment.caption.written_on(frame)
+
+
+@contextmanager
+def offscreen(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[mujoco.MjrContext]:
+    """A current OpenGL context of this size with the model's meshes and textures; freed on exit."""
+    chosen = backend()
+    try:
+        gl = importlib.import_module(f"mujoco.{chosen}").GLContext(*size)
+        gl.make_current()
+    except Exception as error:  # PyOpenGL raises whatever its failed look-up happens to hit
+        raise RuntimeError(_NO_BACKEND.format(chosen)) from error
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    try:
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        yield context
+    finally:
+        context.free()
+        gl.free()
+
+
+@cache
+def backend() -> str:
+    """MUJOCO_GL, or else the first of this system's back ends that makes a context.
+
+    A back end is tried in a process of its own: PyOpenGL binds to one for the life of a process, even when it fails.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if asked in _KNOWN_BACKENDS:
+        return asked
+    if asked:
+        raise RuntimeError(f"MUJOCO_GL={asked!r} cannot render without a display; use one of {_KNOWN_BACKENDS}")
+    candidates = _BACKENDS.get(platform.system(), ("glfw",))
+    for name in candidates:
+        attempt = f"from mujoco.{name} import GLContext; GLContext(8, 8).make_current()"
+        if len(candidates) == 1 or not subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode:
+            return name
+    raise RuntimeError(_NO_BACKEND.format(", ".join(candidates)))
 
 
 def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
