@@ -118,11 +118,7 @@ def _play(
 
 
 def evaluate_rendered(
-    folder: Path,
-    cameras: tuple[Camera, ...],
-    tracks: np.ndarray,
-    rng: np.random.Generator,
-    guided: bool = False,
+    folder: Path, cameras: tuple[Camera, ...], tracks: np.ndarray, rng: np.random.Generator, guided: bool = False
 ) -> Sights:
     """Flights seen by all cameras.
 
@@ -142,7 +138,7 @@ def evaluate_rendered(
             there, all_found, all_seen = not np.isnan(place).any(), True, True
             for camera, detector, shot in zip(cameras, detectors, shots, strict=True):
                 spot, later = camera.project(place)
-                inside = there and bool((spot > EDGE).all() and (spot < np.array(camera.size) - 1 - EDGE).all())
+                inside = there and bool(camera.sees(place[0], EDGE))
                 guesses = [spot + rng.normal(0, 5, 2)] if guided and inside else []
                 found = sights.detect(detector, shot.frame, guesses)
                 if k < LEAD - 1:

@@ -156,12 +156,8 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
     # The normal matrix holds the priors, which are residuals too.
     deviation = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))) * problem.scale
     cameras, delays, drag, _ = problem.parts(x)
-    deviations = {problem.names[i]: float(value) for i, value in zip(problem.free, deviation, strict=False)}
-    undetermined = [
-        problem.names[i]
-        for i, value in zip(problem.free, deviation, strict=False)
-        if value > DETERMINED * problem.prior[i]
-    ]
+    own = {problem.names[i]: (float(v), problem.prior[i]) for i, v in zip(problem.free, deviation, strict=False)}
+    undetermined = tuple(name for name, (value, prior) in own.items() if value > DETERMINED * prior)
     residuals = []
     for camera, seen, flown in zip(cameras, edges, problem.away(x), strict=True):
         away = np.concatenate([seen.residuals(camera), flown.ravel()])
@@ -171,7 +167,8 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
             f"expected residuals within {LARGEST_RESIDUAL} px, got {max(residuals):.2f}; nothing was changed"
         )
     fitted = replace(rig, cameras=tuple(cameras), delays=tuple(delays), residuals=tuple(residuals))
-    return Calibrated(fitted, deviations, tuple(undetermined), len(flights), drag)
+    deviations = {name: value for name, (value, _) in own.items()}
+    return Calibrated(fitted, deviations, undetermined, len(flights), drag)
 
 
 class _Problem:
