@@ -48,7 +48,7 @@ class Picture(NamedTuple):
 
 @dataclass
 class Scene:
-    """A camera and all that stands still before it; the looks may be changed between frames."""
+    """A camera and all that stands still before it; exposure and ball may be changed between frames."""
 
     camera: Camera
     image: np.ndarray  # (h, w, 3) uint8, linear RGB
@@ -61,19 +61,12 @@ class Scene:
     work: np.ndarray = field(init=False)
     bayer: np.ndarray = field(init=False)
     noise: np.ndarray = field(init=False)
+    deviations: np.ndarray = field(init=False)  # (256,) [grey levels] of the noise at each level
 
     def __post_init__(self) -> None:
         self.work, self.bayer = self.image.copy(), mosaic(self.image)
-        self.relight(self.gain, self.brightness)
-
-    def deviations(self) -> np.ndarray:
-        """Standard deviation (256,) [grey levels] of the noise at each level, for ``gain`` and ``brightness``."""
-        return np.sqrt(self.gain * self.brightness * np.arange(256) + READ_NOISE).astype(np.float32)
-
-    def relight(self, gain: float, brightness: float) -> None:
-        """Changes the light: gain of the noise, and a factor on all levels."""
-        self.gain, self.brightness = gain, brightness
-        self.noise = cv2.LUT(self.bayer, self.deviations())
+        self.deviations = np.sqrt(self.gain * self.brightness * np.arange(256) + READ_NOISE).astype(np.float32)
+        self.noise = cv2.LUT(self.bayer, self.deviations)
 
 
 def mosaic(image: np.ndarray) -> np.ndarray:
@@ -338,7 +331,7 @@ def render(
         if patch and before is not None:
             seen *= 1.0 - float((before != image[patch]).any(-1).mean())
     drawn = [box for box in boxes if box is not None]
-    bayer, deviation, table = scene.bayer[view], scene.noise[view], scene.deviations()
+    bayer, deviation = scene.bayer[view], scene.noise[view]
     if drawn:
         bayer, deviation = bayer.copy(), deviation.copy()
     still = scene.image[view]
@@ -346,7 +339,7 @@ def render(
         # The colours of a quad are where they are in the whole frame.
         box = tuple(slice(side.start // 2 * 2, (side.stop + 1) // 2 * 2) for side in (rows, columns))
         bayer[box] = mosaic(image[box])
-        deviation[box] = cv2.LUT(bayer[box], table)
+        deviation[box] = cv2.LUT(bayer[box], scene.deviations)
     for box in drawn:
         image[box] = still[box]
     bank = noise_bank(camera.size[1], camera.size[0])
