@@ -152,7 +152,7 @@ def judge(params: Any, crops: Crops) -> dict[str, float]:
     squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(said.covariance[found]), miss[found])
     half, most = np.percentile(error[found], [50, 90]) if found.any() else (np.nan, np.nan)
     return {
-        "found": found.sum() / max(int(there.sum()), 1),
+        "found": float(found.sum()) / max(int(there.sum()), 1),
         "false": float((said.probability[~there] > 0.5).mean()),
         "error_50": float(half),
         "error_90": float(most),
