@@ -14,8 +14,7 @@ from experiments.view.recorder import Recorder
 from experiments.view.replay import Replay
 from mjx_tt.robot.robots import Robot
 from mjx_tt.viz import rendering
-from mjx_tt.viz.caption import GOOD, POOR, Caption
-from mjx_tt.viz.rendering import Moment
+from mjx_tt.viz.rendering import GOOD, POOR, Caption, Moment
 
 PICTURE_SIZE, VIDEO_SIZE = (1280, 720), (640, 360)
 # [Hz] without a graphics card a frame takes a quarter of a second to draw; a GIF counts in hundredths of a second.

@@ -169,63 +169,54 @@ def load_diagnosis(folder: Path) -> FixedPlaylist:
     if not strokes:
         raise ConfigError(f"{folder}: the logs that it was made from hold no balls")
     ways = {name: _flights(strokes, m) for name, m in (("nominal", nominal), ("extended", extended.model))}
-    misses = {
-        name: np.array([_miss(t, w) for t, w in zip(strokes, flown, strict=True)]) for name, flown in ways.items()
-    }
-    order = np.argsort(-misses["nominal"])[:MOST]
+    misses = {name: [_miss(t, w) for t, w in zip(strokes, flown, strict=True)] for name, flown in ways.items()}
+    order = np.argsort(-np.array(misses["nominal"]))[:MOST]
     home = home_qpos(load_model())
     verdict = json.loads((folder / VERDICT).read_text(encoding="utf-8"))["verdict"]
-    replays, captions = [], []
-    for place, i in enumerate(order):
+    entries, captions = [], []
+    for place, i in enumerate(order, 1):
         t = strokes[i]
         clock = t.time[0] + np.arange(len(ways["nominal"][i])) / RATE
         measured = np.full((len(clock), 3), np.nan)
         _draw(measured, clock, t.time, t.position.T)
-        text = ", ".join(f"{name} misses by {1e3 * misses[name][i]:.0f} mm" for name in ways)
-        replays.append(
-            Replay(
-                time=clock - clock[0],
-                qpos=np.repeat(home[None], len(clock), axis=0),
-                balls={"measured": measured, **{name: flown[i] for name, flown in ways.items()}},
-                title="measured (yellow), nominal (red), extended (green)",
-                decided=float(t.time[-1] - t.time[0]),
-                marks=t.position.T,
-                series={
-                    f"{axis} [m]": Series(
-                        ("measured", "nominal", "extended"),
-                        clock - clock[0],
-                        np.stack([measured[:, k], *(flown[i][:, k] for flown in ways.values())], axis=1),
-                    )
-                    for k, axis in enumerate("xyz")
-                },
-            )
+        balls = {"measured": measured, **{name: flown[i] for name, flown in ways.items()}}
+        axes = np.stack(list(balls.values()), axis=2)
+        replay = Replay(
+            time=clock - clock[0],
+            qpos=np.repeat(home[None], len(clock), axis=0),
+            balls=balls,
+            title="measured (yellow), nominal (red), extended (green)",
+            decided=float(t.time[-1] - t.time[0]),
+            marks=t.position.T,
+            series={f"{axis} [m]": Series(tuple(balls), clock - clock[0], axes[:, k]) for k, axis in enumerate("xyz")},
         )
-        captions.append(f"{verdict}: {t.label}, {place + 1} of {len(order)}; {text}")
-    return FixedPlaylist([[replay] for replay in replays], captions)
+        entries.append([replay])
+        text = ", ".join(f"{name} misses by {1e3 * misses[name][i]:.0f} mm" for name in ways)
+        captions.append(f"{verdict}: {t.label}, {place} of {len(order)}; {text}")
+    return FixedPlaylist(entries, captions)
 
 
 def _nominal(folder: Path, extended: ModelFile) -> SimModel:
     path = extended.provenance.get("model", "nominal")
-    if path == "nominal":
-        return SimModel()
-    if not Path(path).is_file():
-        raise ConfigError(
-            f"{folder / EXTENDED}: provenance.model {path}: no such file; look from where it was diagnosed"
-        )
-    return ModelFile.load(path).model
+    return SimModel() if path == "nominal" else ModelFile.load(_named(folder, "model", path)).model
 
 
 def _logs(folder: Path, extended: ModelFile) -> Iterator[Trajectory]:
     for name in extended.provenance.get("logs", {}):
-        path = Path(name)
-        if not path.is_file():
-            raise ConfigError(
-                f"{folder / EXTENDED}: provenance.logs {path}: no such file; look from where it was diagnosed"
-            )
+        path = _named(folder, "logs", name)
         if session_logs.is_session(path):
             yield from session_logs.flights(read(path))
         elif path.name not in ("command.csv", "state.csv"):
             yield from diagnosis.load_logs([path]).balls
+
+
+def _named(folder: Path, key: str, name: str) -> Path:
+    """A file that the extended model's provenance names. Raises ConfigError where it is not there."""
+    if not (path := Path(name)).is_file():
+        raise ConfigError(
+            f"{folder / EXTENDED}: provenance.{key} {path}: no such file; look from where it was diagnosed"
+        )
+    return path
 
 
 def _flights(strokes: Sequence[Trajectory], model: SimModel) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import jax
@@ -21,6 +21,7 @@ from mjx_tt.rally import human_player
 from mjx_tt.rally.ball_flights import drive_home
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.rally.simulator import RallySimulator, ShotResult
+from mjx_tt.robot import robots
 from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import SimModel
 
@@ -38,6 +39,9 @@ class Playlist(Protocol):
         """Number of the entries; None without an end."""
         ...
 
+    @property
+    def robot(self) -> Robot: ...
+
     def replays(self, number: int) -> list[Replay]: ...
 
     def caption(self, number: int) -> str: ...
@@ -45,11 +49,11 @@ class Playlist(Protocol):
 
 @dataclass(frozen=True)
 class FixedPlaylist:
-    """A finished list; ``robot`` of its replays, None: the paper's."""
+    """A finished list; ``robot`` of its replays."""
 
     entries: Sequence[Sequence[Replay]]
     captions: Sequence[str]
-    robot: Robot | None = None
+    robot: Robot = field(default_factory=robots.paper)
 
     @property
     def count(self) -> int | None:
@@ -87,6 +91,10 @@ class PolicyPlaylist:
         self._pools: dict[str, np.ndarray] = {}
         self._blocks: dict[int, list[Replay]] = {}
         self._rally: Rally | None = None
+
+    @property
+    def robot(self) -> Robot:
+        return self.recorder.simulator.config.robot
 
     def clear(self) -> None:
         """Forgets replays made with other settings; a rally goes on with the new ones."""
@@ -152,8 +160,7 @@ class PolicyPlaylist:
         if name not in self._pools:
             key, ball = build.key(self.seed, build.EVALUATION_BALLS), self.recorder.world.model.ball
             distribution = self.distribution if name in (self.distribution.name, UNNAMED) else registry.load(name)
-            pool = sample_pool(key, distribution, ball, POOL)
-            state = pool.state
+            state = sample_pool(key, distribution, ball, POOL).state
             self._pools[name] = np.concatenate([np.asarray(a) for a in (state.position, state.velocity, state.spin)])
         return self._pools[name]
 
@@ -200,7 +207,8 @@ class Rally:
     def _with_player(self, replay: Replay, i: int, shot: ShotResult) -> Replay:
         """The replay up to the player's contact, the robot on its way home after its own."""
         end, touches = End(int(shot.end[i])), int(shot.touch[i]) + int(shot.outcome[i] != MISSED)
-        text = f"touch {touches}" if end is End.NONE else f"rally of {touches} over: {_words(end)}"
+        words = end.name.lower().replace("_", " ")
+        text = f"touch {touches}" if end is End.NONE else f"rally of {touches} over: {words}"
         last = replay.frame(float(shot.seconds[i])) if end is End.NONE else len(replay.time) - 1
         qpos, hit = replay.qpos[: last + 1].copy(), replay.frame(replay.decided)
         since = replay.time[hit : last + 1] - replay.decided
@@ -209,11 +217,5 @@ class Rally:
             seconds = jnp.asarray(np.maximum(replay.time - replay.decided, 0.0), jnp.float32)
             home, limits = self._simulator.task.home, self._simulator.task.contract.limits
             qpos[hit:] = np.asarray(drive_home(home, at_hit, seconds, limits)).T[hit : last + 1]
-        balls = {"ball": replay.balls["ball"][: last + 1]}
-        outcome = f"{replay.outcome}; {text}"
-        time = replay.time[: last + 1]
-        return replace(replay, time=time, qpos=qpos, balls=balls, outcome=outcome)
-
-
-def _words(end: End) -> str:
-    return end.name.lower().replace("_", " ")
+        time, balls = replay.time[: last + 1], {"ball": replay.balls["ball"][: last + 1]}
+        return replace(replay, time=time, qpos=qpos, balls=balls, outcome=f"{replay.outcome}; {text}")

@@ -6,7 +6,7 @@ so the same ball meets the same latencies and noise under other parameters and a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -155,18 +155,16 @@ class Recorder:
 
     def _episodes(self, draws: Draws, values: Mapping[str, Any]) -> Episodes:
         config, model, shape = self.simulator.config, self.model(draws, values), draws.seed.shape
-        mean, std = (
-            jnp.stack([jnp.broadcast_to(getattr(model.latency, name + end), shape) for name in LATENCIES])
-            for end in ("", "_std")
-        )
+
+        def rows(part: Any, names: Iterable[str]) -> Array:
+            return jnp.stack([jnp.broadcast_to(getattr(part, name), shape) for name in names])
+
+        mean, std = (rows(model.latency, [name + end for name in LATENCIES]) for end in ("", "_std"))
         longest = jnp.array([config.max_observation_latency] * 3 + [config.max_action_latency] * 2)[:, None]
-        mean_spin, std_spin = (
-            jnp.stack([jnp.broadcast_to(getattr(model.ball_spin, f"{kind}_{axis}"), shape) for axis in "xyz"])
-            for kind in ("mean", "std")
-        )
-        spin = draws.ball.spin + mean_spin + std_spin * draws.spin
-        home = jnp.broadcast_to(jnp.asarray(self.simulator.task.home, jnp.float32)[:, None], (len(self.joints), *shape))
         latency = jnp.clip(mean + std * draws.latency, 0.0, longest)
+        mean, std = (rows(model.ball_spin, [f"{kind}_{axis}" for axis in "xyz"]) for kind in ("mean", "std"))
+        spin = draws.ball.spin + mean + std * draws.spin
+        home = jnp.broadcast_to(jnp.asarray(self.simulator.task.home, jnp.float32)[:, None], (len(self.joints), *shape))
         return Episodes(replace(draws.ball, spin=spin), latency, jnp.asarray(draws.seed), model, home)
 
     def record(self, policies: Sequence[Policy], episodes: Episodes) -> dict[str, np.ndarray]:
@@ -230,7 +228,7 @@ class Recorder:
         text = f"{OUTCOMES[int(r['outcome'])]}, {speeds[0]:.1f} m/s"
         if r["hit"]:
             text += f" in, {speeds[over]:.1f} m/s out"
-        weights = self.simulator.config.reward_weights
+        terms = zip(self.simulator.config.terms, r["terms"], self.simulator.config.reward_weights, strict=True)
         seen, joints = r["observation"][played], self.joints
         return Replay(
             time=time,
@@ -245,8 +243,5 @@ class Recorder:
                 "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3 : 3 + len(joints)]),
                 "Output: share of the joints' speed": Series(joints, ticks[played], r["action"][played]),
             },
-            terms={
-                name: (float(value), float(weight))
-                for name, value, weight in zip(self.simulator.config.terms, r["terms"], weights, strict=True)
-            },
+            terms={name: (float(value), float(weight)) for name, value, weight in terms},
         )

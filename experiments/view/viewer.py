@@ -20,12 +20,10 @@ from experiments.runs import load_policy
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.view.auth import Server
 from experiments.view.controls import Controls
-from experiments.view.playlist import FixedPlaylist, Playlist, PolicyPlaylist
+from experiments.view.playlist import Playlist, PolicyPlaylist
 from experiments.view.recorder import Recorder
 from experiments.view.replay import Replay, Series
 from experiments.view.scene import COLOURS, Scene
-from mjx_tt.robot import robots
-from mjx_tt.robot.robots import Robot
 
 FRAME = 1.0 / 60.0  # [s]
 REST = 0.6  # [s] on the last frame before the next ball
@@ -46,10 +44,9 @@ class Viewer:
 
     def __init__(self, server: viser.ViserServer, playlist: Playlist) -> None:
         self.server, self.playlist = server, playlist
-        self.scene = Scene(server, len(playlist.replays(0)), robot_of(playlist))
+        self.scene = Scene(server, len(playlist.replays(0)), playlist.robot)
         self.number, self.t, self.playing = 0, 0.0, True
         self.shown: Sequence[Replay] = ()
-        self.frames = 0
         self.poll: Callable[[], None] = lambda: None
         self._queue: dict[str, Callable[[], None]] = {}
         self._lock, self._stop = threading.Lock(), threading.Event()
@@ -177,7 +174,6 @@ class Viewer:
                 self.go(self.number + 1)
         if self._dirty:
             self._dirty = False
-            self.frames += 1
             self.scene.show(self.t)
             self._time.value = float(min(self.t, self.seconds))
             self._plot()
@@ -280,13 +276,6 @@ def title_of(trained: load_policy.TrainedPolicy) -> str:
     return folder.parent.name if folder.name == "artefact" else folder.name
 
 
-def robot_of(playlist: Playlist) -> Robot:
-    """The robot that a playlist shows; a diagnosis of balls shows the paper's."""
-    if isinstance(playlist, PolicyPlaylist):
-        return playlist.recorder.simulator.config.robot
-    return (playlist.robot if isinstance(playlist, FixedPlaylist) else None) or robots.paper()
-
-
 def follow_training(folder: Path, viewer: Viewer) -> None:
     """Makes a viewer of one policy play each new checkpoint of its run."""
     run, playlist = Run(folder), viewer.playlist
@@ -317,7 +306,7 @@ def wait_for_checkpoint(folder: Path, console: Console) -> None:
 
 def export(server: Server, playlist: Playlist, entries: int, path: Path) -> int:
     """Writes a page with the first ``entries`` entries that needs no server; returns its size in bytes."""
-    scene = Scene(server, len(playlist.replays(0)), robot_of(playlist))
+    scene = Scene(server, len(playlist.replays(0)), playlist.robot)
     recording = server.get_scene_serializer()
     for number in range(entries if playlist.count is None else min(entries, playlist.count)):
         replays = playlist.replays(number)

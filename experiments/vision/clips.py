@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from collections.abc import Iterator
@@ -11,17 +10,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from experiments.errors import ConfigError
 from experiments.vision.render import mosaic
 from robot_io.vision.recording import FrameReader
 
-NAMES = {
-    "frame": ("frame", "img", "image", "frame_id"),
-    "x": ("x", "u"),
-    "y": ("y", "v"),
-    "visibility": ("visibility", "visible"),
-}
+NAMES = {"img": "frame", "image": "frame", "frame_id": "frame", "u": "x", "v": "y", "visible": "visibility"}
 
 
 @dataclass(frozen=True)
@@ -90,41 +85,28 @@ def read_labels(path: str | os.PathLike) -> Labels:
     """
     path = Path(path)
     try:
-        text = path.read_text("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: expected text, a CSV or JSON; got something else") from None
-    try:
-        rows = _json_rows(text) if path.suffix == ".json" else _csv_rows(text)
-        labels: Labels = {}
-        for frame, x, y, visible in rows:
-            place = np.array([float(x or "nan"), float(y or "nan")])
-            there = float(visible or 1) > 0 and bool((place >= 0).all())
-            labels[int(float(Path(str(frame)).stem))] = place if there else None
+        if path.suffix == ".json":
+            table = pd.DataFrame.from_dict(json.loads(path.read_text("utf-8-sig")), "index").reset_index(names="frame")
+        else:
+            table = pd.read_csv(path, encoding="utf-8-sig", skipinitialspace=True)
+        table = table.rename(columns=lambda name: str(name).strip().lower())
+        table = table.rename(columns={other: own for other, own in NAMES.items() if own not in table})
+        if missing := [name for name in ("frame", "x", "y") if name not in table]:
+            raise ValueError(f"got {', '.join(table)}, which lacks {', '.join(missing)}")
+        frames = [int(float(Path(str(frame)).stem)) for frame in table["frame"]]
+        places = table[["x", "y"]].to_numpy(float)
+        there = (places >= 0).all(1)
+        if "visibility" in table:
+            there &= table["visibility"].fillna(1) > 0
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ConfigError(f"{path}: expected the columns frame,x,y or a JSON of frames with x and y; {error}") from None
-    if not labels:
+    if not frames:
         raise ConfigError(f"{path}: expected labels, got none")
-    return labels
-
-
-def _csv_rows(text: str) -> list[tuple[str, str, str, str]]:
-    reader = csv.DictReader(text.splitlines())
-    given = {name.strip().lower(): name for name in reader.fieldnames or ()}
-    column = {key: next((given[n] for n in names if n in given), None) for key, names in NAMES.items()}
-    missing = [key for key in ("frame", "x", "y") if column[key] is None]
-    if missing:
-        raise ValueError(f"got {', '.join(given) or 'no header'}, which lacks {', '.join(missing)}")
-    return [tuple((row[name] or "").strip() if name else "" for name in column.values()) for row in reader]  # type: ignore[misc]
-
-
-def _json_rows(text: str) -> list[tuple[str, str, str, str]]:
-    return [(frame, str(at["x"]), str(at["y"]), "") for frame, at in json.loads(text).items()]
+    return {frame: place if seen else None for frame, place, seen in zip(frames, places, there, strict=True)}
 
 
 def write_labels(path: str | os.PathLike, labels: Labels) -> None:
     """Writes labels as a CSV with the columns frame, x and y."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("frame", "x", "y"))
-        for frame, place in sorted(labels.items()):
-            writer.writerow((frame, "", "") if place is None else (frame, f"{place[0]:.2f}", f"{place[1]:.2f}"))
+    rows = {frame: (np.nan, np.nan) if place is None else place for frame, place in sorted(labels.items())}
+    table = pd.DataFrame.from_dict(rows, "index", columns=["x", "y"]).rename_axis("frame")
+    table.to_csv(path, float_format="%.2f", lineterminator="\r\n")

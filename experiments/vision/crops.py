@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -11,13 +12,12 @@ import numpy as np
 
 from experiments.vision import render as pictures
 from experiments.vision.flights import draw_camera
-from robot_io.vision.detector import AROUND, SIZE, Detector
+from robot_io.vision.detector import AROUND, FRAMES, SIZE, Detector, cut_windows, widen
 
 PER_SCENE = 80
 GAP = 0.008  # [s] between frames of the paper's cameras
 SEEN = 0.4  # share of a ball that must be seen for it to count
 HARDLY = 0.1  # share below which it counts as hidden
-VIDEO_FOCAL = (400.0, 1300.0)  # [px]
 
 
 @dataclass(frozen=True)
@@ -31,27 +31,19 @@ class Crops:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def save(self, path: str) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes them to an NPZ."""
-        np.savez(path, fine=self.fine, coarse=self.coarse, labels=self.labels)
+        np.savez(path, **vars(self))
 
     @classmethod
-    def load(cls, *paths: str) -> Crops:
+    def load(cls, *paths: str | Path) -> Crops:
         """Reads NPZs and joins them."""
-        parts = []
-        for path in paths:
-            with np.load(path) as file:
-                parts.append(cls(file["fine"], file["coarse"], file["labels"]))
-        return cls.join(parts)
+        return cls.join([cls(**np.load(path)) for path in paths])
 
     @classmethod
-    def join(cls, parts: list[Crops]) -> Crops:
+    def join(cls, parts: Sequence[Crops]) -> Crops:
         """All of several."""
-        return cls(*(np.concatenate([getattr(part, key) for part in parts]) for key in ("fine", "coarse", "labels")))
-
-    def every(self, step: int) -> Crops:
-        """Every so many of them."""
-        return Crops(self.fine[::step], self.coarse[::step], self.labels[::step])
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 class Shots(NamedTuple):
@@ -64,23 +56,10 @@ class Shots(NamedTuple):
 
 def cut(frames: list[np.ndarray], corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fine and coarse crop (SIZE, SIZE, 3) with the fine one's corner (2,) [px, even] in whole frames, newest first."""
-    u, v = (int(x) for x in corner)
-    pad = AROUND
-    fine = np.stack([f[v : v + SIZE, u : u + SIZE] for f in frames], -1)
-    wide = []
-    for frame in frames:
-        height, width = frame.shape
-        half = cv2.resize(
-            frame[max(v - pad, 0) : min(v + SIZE + pad, height), max(u - pad, 0) : min(u + SIZE + pad, width)],
-            None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA,
-        )  # fmt: skip
-        top, left = max(pad - v, 0) // 2, max(pad - u, 0) // 2
-        wide.append(
-            cv2.copyMakeBorder(
-                half, top, SIZE - half.shape[0] - top, left, SIZE - half.shape[1] - left, cv2.BORDER_REPLICATE
-            )
-        )
-    return fine, np.stack(wide, -1)
+    halves = [cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames]
+    halves = [widen(half, AROUND // 2) for half in halves]
+    fine, coarse = (cut_windows(parts, at) for parts, at in ((frames, corner), (halves, corner // 2)))
+    return fine.transpose(1, 2, 0), coarse.transpose(1, 2, 0)
 
 
 def make_crops(
@@ -101,9 +80,9 @@ def make_crops(
     """
     fine = np.empty((count, SIZE, SIZE, 3), np.uint8)
     coarse, labels = np.empty_like(fine), np.zeros((count, 6), np.float32)
-    for done, shots in enumerate(draw_shots(count, tracks, rng, float(video), float(dressed))):
-        fine[done], coarse[done] = cut(shots.frames, shots.corner)
-        labels[done] = shots.label
+    for k, shots in enumerate(draw_shots(count, tracks, rng, float(video), float(dressed))):
+        fine[k], coarse[k] = cut(shots.frames, shots.corner)
+        labels[k] = shots.label
     return Crops(fine, coarse, labels)
 
 
@@ -122,8 +101,7 @@ def draw_shots(
     done = 0
     while done < count:
         film, worn = (share >= 1 or (share > 0 and rng.random() < share) for share in (video, dressed))
-        camera = draw_camera(rng, VIDEO_FOCAL) if film else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, dressed=worn)
+        scene, actors = pictures.make_scene(draw_camera(rng, film), rng), pictures.Actors(rng, dressed=worn)
         for _ in range(PER_SCENE):
             shots = _draw_shots(scene, actors, tracks, rng, film)
             if shots is not None and done < count:
@@ -171,16 +149,13 @@ def _draw_shots(
     right, bottom = np.minimum(corner + SIZE + AROUND, [width, height])
     window = (int(x), int(y), int(right - x), int(bottom - y))
     shots = []
-    for k in range(3):
-        at = time - k * gap
-        ball = path(np.array([at]))[0]
-        shapes = actors.capsules(at, None if np.isnan(ball[0]) else ball)
+    for at in (time - k * gap for k in range(FRAMES)):
+        shapes = actors.capsules(at, path(np.array([at]))[0])
         shots.append(pictures.render(scene, path, at, rng, shapes, window))
     seen, spot = shots[0].seen, now - corner
     inside = (spot > 2).all() and (spot < SIZE - 3).all()
-    if not (inside and seen > SEEN) and not (inside and seen < HARDLY):
-        if (spot > -12).all() and (spot < SIZE + 12).all():
-            return None
+    if not (inside and (seen > SEEN or seen < HARDLY)) and (spot > -12).all() and (spot < SIZE + 12).all():
+        return None
     frames: list[np.ndarray] = [shot.frame for shot in shots]
     if video and rng.random() < 0.7:
         quality = int(rng.integers(35, 96))
@@ -211,7 +186,7 @@ def mine_crops(
     """
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(scenes):
-        camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
+        camera = draw_camera(rng, video)
         scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8, dressed=rng.random() < 0.5)
         gap = rng.uniform(0.008, 0.04) if video else GAP
         begin, quality = rng.uniform(0, 10), int(rng.integers(35, 96))

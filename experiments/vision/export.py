@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,37 +24,38 @@ Weights = Mapping[str, Mapping[str, Any]]
 
 
 class _Graph:
-    """Nodes and constants of a graph, in order."""
+    """Nodes of a graph in order, each named by its output; constants, and weights as LAYER/kernel and LAYER/bias."""
 
-    def __init__(self) -> None:
+    def __init__(self, weights: Weights, **constants: Any) -> None:
         self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+        named = {
+            f"{layer}/{leaf}": np.asarray(value) for layer, part in weights.items() for leaf, value in part.items()
+        }
+        # A convolution's kernel (h, w, in, out) is (out, in, h, w) here.
+        named = {name: value.transpose(3, 2, 0, 1) if value.ndim == 4 else value for name, value in named.items()}
+        self.constants = named | {name: np.asarray(value) for name, value in constants.items()}
 
-    def constant(self, name: str, value: Any) -> str:
-        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
+    def add(self, kind: str, *inputs: str, output: str = "", **attributes: Any) -> str:
+        output = output or f"{kind}{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, inputs, [output], **attributes))
+        return output
 
-    def add(self, kind: str, inputs: list[str], name: str, **attributes: Any) -> str:
-        self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
-        return name
-
-    def convolve(self, x: str, name: str, layer: Mapping[str, Any], dilation: int = 1, stride: int = 1) -> str:
+    def convolve(self, x: str, layer: str, dilation: int = 1, stride: int = 1, output: str = "") -> str:
         """A convolution that pads as XLA's SAME does for even sides."""
-        kernel = np.asarray(layer["kernel"])
-        span = dilation * (kernel.shape[0] - 1)
-        low = (span - stride + 1) // 2 if stride > 1 else span // 2
+        span = dilation * (self.constants[f"{layer}/kernel"].shape[-1] - 1)
+        low = (span - stride + 1) // 2
         high = span - (stride - 1) - low
-        inputs = [
-            x,
-            self.constant(f"{name}/kernel", kernel.transpose(3, 2, 0, 1)),
-            self.constant(f"{name}/bias", np.asarray(layer["bias"])),
-        ]
-        return self.add(
-            "Conv", inputs, name, dilations=[dilation] * 2, strides=[stride] * 2, pads=[low, low, high, high]
-        )  # fmt: skip
+        shape = {"dilations": [dilation] * 2, "strides": [stride] * 2, "pads": [low, low, high, high]}
+        return self.add("Conv", x, f"{layer}/kernel", f"{layer}/bias", output=output, **shape)
 
-    def save(self, path: Path, inputs: list[Any], outputs: list[Any]) -> None:
-        graph = helper.make_graph(self.nodes, path.stem, inputs, outputs, self.constants)
+    def save(self, path: Path, kind: int, inputs: Mapping[str, Sequence], outputs: Mapping[str, Sequence]) -> None:
+        """Writes it; shapes of inputs, which are of a kind, and of outputs, which are floats."""
+        given, said = (
+            [helper.make_tensor_value_info(name, number, ["n", *shape]) for name, shape in ends.items()]
+            for ends, number in ((inputs, kind), (outputs, TensorProto.FLOAT))
+        )
+        constants = [numpy_helper.from_array(value, name) for name, value in self.constants.items()]
+        graph = helper.make_graph(self.nodes, path.stem, given, said, constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
         onnx.checker.check_model(model)
         onnx.save(model, path)
@@ -63,78 +64,47 @@ class _Graph:
 def export_network(path: Path, params: Weights) -> None:
     """Writes the network: inputs fine, coarse (n, 3, 64, 64) uint8, newest frame first; what ``network`` says of
     fine and of coarse cells (n, c, 16, 16)."""
-    g = _Graph()
-    full, dark = g.constant("full", np.float32(255)), g.constant("dark", np.float32(network.DARK))
+    side = SIZE // 4
+    middle = {"starts": [side // 4] * 2, "ends": [3 * side // 4] * 2, "axes": [2, 3]}
+    g = _Graph(
+        params,
+        full=np.float32(255),
+        dark=np.float32(network.DARK),
+        scales=np.array([1, 1, 2, 2], np.float32),
+        **{name: np.array(value, np.int64) for name, value in middle.items()},
+    )
 
     def prepare(name: str) -> str:
-        x = g.add("Cast", [name], f"{name}/float", to=TensorProto.FLOAT)
-        x = g.add("SpaceToDepth", [x], f"{name}/quads", blocksize=2)
-        x = g.add("Add", [g.add("Div", [x, full], f"{name}/scaled"), dark], f"{name}/lifted")
-        return g.add("Sqrt", [x], f"{name}/root")
+        quads = g.add("SpaceToDepth", g.add("Cast", name, to=TensorProto.FLOAT), blocksize=2)
+        return g.add("Sqrt", g.add("Add", g.add("Div", quads, "full"), "dark"))
 
-    def relu(x: str) -> str:
-        return g.add("Relu", [x], f"{x}/relu")
+    def convolve(x: str, layer: str, dilation: int = 1, stride: int = 1) -> str:
+        return g.add("Relu", g.convolve(x, layer, dilation, stride))
 
-    far = relu(g.convolve(prepare("coarse"), "coarse0/first", params["coarse"], stride=2))
+    far = convolve(prepare("coarse"), "coarse", stride=2)
     for k, dilation in enumerate(network.COARSE_BLOCKS):
-        far = g.add("Add", [far, relu(g.convolve(far, f"far{k}", params[f"coarse{k}"], dilation))], f"far{k}/sum")
-    past = relu(g.convolve(far, "past", params["past"]))
-    past = g.convolve(past, "past_cells", params["past_out"])
-    quarter = SIZE // 16
-    ends = [
-        g.constant(n, np.array(v, np.int64))
-        for n, v in (("starts", [quarter] * 2), ("ends", [3 * quarter] * 2), ("axes", [2, 3]))
-    ]
-    far = g.add("Slice", [far, *ends], "far/middle")
-    far = g.convolve(far, "far/join", params["join"])
-    scales = g.constant("scales", np.array([1, 1, 2, 2], np.float32))
-    far = g.add(
-        "Resize",
-        [far, "", scales],
-        "far/wide",
-        mode="nearest",
-        coordinate_transformation_mode="asymmetric",
-        nearest_mode="floor",
-    )
-    x = relu(g.convolve(prepare("fine"), "fine0/first", params["fine"], stride=2))
+        far = g.add("Add", far, convolve(far, f"coarse{k}", dilation))
+    g.convolve(convolve(far, "past"), "past_out", output="past_cells")
+    far = g.convolve(g.add("Slice", far, *middle), "join")
+    nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    far = g.add("Resize", far, "", "scales", **nearest)
+    x = convolve(prepare("fine"), "fine", stride=2)
     for k, dilation in enumerate(network.BLOCKS):
         if k == 1:
-            x = g.add("Add", [x, far], "joined")
-        y = relu(g.convolve(x, f"block{k}", params[f"block{k}"], dilation))
-        x = g.add("Add", [x, g.convolve(y, f"mix{k}", params[f"mix{k}"])], f"sum{k}")
-    x = relu(g.convolve(x, "last", params["last"]))
-    out = g.convolve(x, "cells", params["out"])
-    inputs = [
-        helper.make_tensor_value_info(n, TensorProto.UINT8, ["n", FRAMES, SIZE, SIZE]) for n in ("fine", "coarse")
-    ]
-    outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", numbers, SIZE // 4, SIZE // 4])
-        for name, numbers in ((out, OUTPUTS), (past, FAR_OUTPUTS))
-    ]
-    g.save(path, inputs, outputs)
+            x = g.add("Add", x, far)
+        x = g.add("Add", x, g.convolve(convolve(x, f"block{k}", dilation), f"mix{k}"))
+    g.convolve(convolve(x, "last"), "out", output="cells")
+    window = (FRAMES, SIZE, SIZE)
+    outputs = {"cells": (OUTPUTS, side, side), "past_cells": (FAR_OUTPUTS, side, side)}
+    g.save(path, TensorProto.UINT8, {"fine": window, "coarse": window}, outputs)
 
 
 def export_search(path: Path, layers: Weights) -> None:
     """Writes the classifier of places: features (n, 490) to scores (n,), the logarithm of the odds of a ball."""
-    g, x = _Graph(), "places"
-    for name in ("first", "second"):
-        x = g.add(
-            "Gemm",
-            [
-                x,
-                g.constant(f"{name}/kernel", np.asarray(layers[name]["kernel"])),
-                g.constant(f"{name}/bias", np.asarray(layers[name]["bias"])),
-            ],
-            name,
-        )
-        x = g.add("Relu", [x], f"{name}/relu") if name == "first" else x
-    out = g.add("Squeeze", [x, g.constant("last", np.array([1], np.int64))], "score")
-    size = 2 * (FRAMES * (2 * PLACE + 1) ** 2 + 2)
-    g.save(
-        path,
-        [helper.make_tensor_value_info("places", TensorProto.FLOAT, ["n", size])],
-        [helper.make_tensor_value_info(out, TensorProto.FLOAT, ["n"])],
-    )
+    g = _Graph(layers, last=np.array([1], np.int64))
+    x = g.add("Relu", g.add("Gemm", "places", "first/kernel", "first/bias"))
+    g.add("Squeeze", g.add("Gemm", x, "second/kernel", "second/bias"), "last", output="score")
+    g.save(path, TensorProto.FLOAT, {"places": (2 * (FRAMES * (2 * PLACE + 1) ** 2 + 2),)}, {"score": ()})
 
 
 def export(folder: Path, params: Weights, search: Weights, crops: Crops) -> float:

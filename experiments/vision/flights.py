@@ -16,7 +16,7 @@ from robot_io.vision.camera import Camera, look_at
 RATE = 1000.0  # [Hz] of the tracks
 LENGTH = 1.0  # [s]
 HELD_OUT = 10  # every tenth flight is for evaluation only
-FOCAL = (750.0, 1500.0)  # [px]
+FOCAL, VIDEO_FOCAL = (750.0, 1500.0), (400.0, 1300.0)  # [px]
 
 
 def fly_balls(count: int, seed: int) -> np.ndarray:
@@ -49,8 +49,8 @@ def split_flights(tracks: np.ndarray, held_out: bool) -> np.ndarray:
     return tracks[(np.arange(len(tracks)) % HELD_OUT == 0) == held_out]
 
 
-def draw_camera(rng: np.random.Generator, focal: tuple[float, float] = FOCAL) -> Camera:
-    """A camera somewhere beside the table that looks at it."""
+def draw_camera(rng: np.random.Generator, video: bool) -> Camera:
+    """A camera somewhere beside the table that looks at it, with a lens as the paper's or as of ordinary video."""
     centre = np.array([rng.choice([-1, 1]) * rng.uniform(1.2, 3.2), rng.uniform(-2.2, 1.2), rng.uniform(0.6, 2.6)])
     target = rng.uniform([-0.3, -0.5, -0.2], [0.3, 0.7, 0.3])
-    return look_at("drawn", tuple(centre), tuple(target), rng.uniform(*focal))
+    return look_at("drawn", tuple(centre), tuple(target), rng.uniform(*(VIDEO_FOCAL if video else FOCAL)))

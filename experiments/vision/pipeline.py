@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments.progress import Stage
-from experiments.vision import export, flights, network, search, training
+from experiments.vision import export, flights, network, training
 from experiments.vision.crops import Crops, make_crops, mine_crops
 from experiments.vision.evaluation import WITHIN, evaluate_rendered, use_one_core
 from robot_io.vision import rig
@@ -58,40 +58,39 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
     _claim(work / "plan.json", plan)
     use_one_core()
 
+    def tell(step: int, cost: float) -> None:
+        note(f"  step {step}: cost {cost:.3f}")
+
     tracks_file = work / "tracks.npy"
     if not tracks_file.exists():
         with stage(f"{plan.flights} flights"):
             np.save(tracks_file, flights.fly_balls(plan.flights, plan.seed + 1))
     tracks = np.load(tracks_file)
+    flown = flights.split_flights(tracks, held_out=False)
     for number, (name, count) in enumerate((("hall", plan.hall), ("film", plan.film), ("held_out", plan.held_out))):
-        if not (work / f"{name}.npz").exists():
+        if not (file := work / f"{name}.npz").exists():
             with stage(f"{count} crops: {name}"):
-                flown = flights.split_flights(tracks, name == "held_out")
-                make_crops(count, flown, np.random.default_rng(plan.seed + 11 + number), name == "film").save(
-                    str(work / f"{name}.npz")
-                )
-    crops = Crops.load(str(work / "hall.npz"), str(work / "film.npz"))
-    held_out = Crops.load(str(work / "held_out.npz"))
+                chosen = flights.split_flights(tracks, name == "held_out")
+                make_crops(count, chosen, np.random.default_rng(plan.seed + 11 + number), name == "film").save(file)
+    crops = Crops.load(work / "hall.npz", work / "film.npz")
+    held_out = Crops.load(work / "held_out.npz")
 
     first = work / "first.npz"
     if not first.exists():
         with stage(f"network, {plan.first_steps} steps"):
-            training.save(first, training.train(crops, plan.first_steps, plan.seed, report=_tell(note)))
+            training.save(first, training.train(crops, plan.first_steps, plan.seed, report=tell))
     dressed = work / "dressed.npz"
     if not dressed.exists():
         with stage(f"{plan.dressed} crops: dressed people"):
-            flown = flights.split_flights(tracks, False)
             rng = np.random.default_rng(plan.seed + 21)
             parts = [make_crops(plan.dressed // 2, flown, rng, video, dressed=True) for video in (False, True)]
-            Crops.join(parts).save(str(dressed))
+            Crops.join(parts).save(dressed)
     seen = work / "places.npz"
     if not seen.exists():
         with stage(f"{plan.places} crops for the search"):
-            flown = flights.split_flights(tracks, False)
-            features, balls = search.collect_places(plan.places, flown, np.random.default_rng(plan.seed + 41))
+            features, balls = training.collect_places(plan.places, flown, np.random.default_rng(plan.seed + 41))
             np.savez(seen, features=features, balls=balls)
-    with np.load(seen) as file:
-        order = search.train_search(file["features"], file["balls"])
+    order = training.train_search(**np.load(seen))
     hard = work / "hard.npz"
     if not hard.exists():
         with stage("hard negatives"):
@@ -101,21 +100,19 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
                 mine_crops(detector, count, np.random.default_rng(plan.seed + 31 + video), video=bool(video))
                 for video, count in enumerate((plan.hall_scenes, plan.film_scenes))
             ]
-            Crops.join(mined).save(str(hard))
-    crops = Crops.join([crops, Crops.load(str(dressed)), *[Crops.load(str(hard))] * HARD_SHARE])
+            Crops.join(mined).save(hard)
+    crops = Crops.join([crops, Crops.load(dressed), *[Crops.load(hard)] * HARD_SHARE])
     second = work / "second.npz"
     if not second.exists():
         with stage(f"network again, {plan.steps} steps"):
-            params = training.train(
-                crops, plan.steps, plan.seed + 1, training.load(first), training.RATE * 0.7, _tell(note)
-            )
+            params = training.train(crops, plan.steps, plan.seed + 1, training.load(first), training.RATE * 0.7, tell)
             training.save(second, params)
     with stage("covariance, export"):
         params = training.load(second)
         export.export(out, params, order, held_out)
-        flown = flights.split_flights(tracks, False)[: plan.calibration_flights]
-        sights = evaluate_rendered(out, rig.standard().cameras, flown, np.random.default_rng(plan.seed + 51))
-        params = calibrate(params, sights.squared)
+        some, rng = flown[: plan.calibration_flights], np.random.default_rng(plan.seed + 51)
+        sights = evaluate_rendered(out, rig.standard().cameras, some, rng)
+        params = calibrate(params, np.array(sights.squared))
         export.export(out, params, order, held_out)
     return judge(params, held_out)
 
@@ -124,29 +121,6 @@ def _claim(file: Path, plan: Plan) -> None:
     if file.exists() and json.loads(file.read_text("utf-8")) != asdict(plan):
         raise ValueError(f"{file.parent}: expected the work of this plan, got another's; choose another --out")
     file.write_text(json.dumps(asdict(plan), indent=1), "utf-8")
-
-
-def _tell(note: Callable[[str], object]) -> Callable[[int, float, Any], object]:
-    return lambda step, cost, params: note(f"  step {step}: cost {cost:.3f}")
-
-
-def _say(params: Any, crops: Crops) -> Cells:
-    """What the network says of crops."""
-    said = []
-    for i in range(0, len(crops), 200):
-        out = network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])
-        said.append(read_cells(*(np.asarray(part).transpose(0, 3, 1, 2) for part in out)))
-    return Cells(*(np.concatenate(parts) for parts in zip(*said, strict=True)))
-
-
-def _squared(params: Any, crops: Crops) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of balls that were found: errors [px], and squared errors over the covariance; and the rest's probabilities."""
-    said, there = _say(params, crops), crops.labels[:, 0] > 0
-    miss = said.centre - crops.labels[:, 1:3]
-    error = np.linalg.norm(miss, axis=1)
-    found = there & (said.probability > 0.5) & (error < WITHIN)
-    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(said.covariance[found]), miss[found])
-    return error[found], squared, said.probability[~there]
 
 
 def calibrate(params: Any, squared: np.ndarray) -> Any:
@@ -167,12 +141,19 @@ def calibrate(params: Any, squared: np.ndarray) -> Any:
 
 def judge(params: Any, crops: Crops) -> dict[str, float]:
     """Figures on crops: share found, false shares, errors [px], squared errors over the covariance."""
-    error, squared, empty = _squared(params, crops)
-    half, most = np.percentile(error, [50, 90]) if len(error) else (np.nan, np.nan)
-    found = len(error) / max(int((crops.labels[:, 0] > 0).sum()), 1)
+    parts = []
+    for i in range(0, len(crops), 200):
+        out = network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])
+        parts.append(read_cells(*(np.asarray(part).transpose(0, 3, 1, 2) for part in out)))
+    said = Cells(*map(np.concatenate, zip(*parts, strict=True)))
+    there, miss = crops.labels[:, 0] > 0, said.centre - crops.labels[:, 1:3]
+    error = np.linalg.norm(miss, axis=1)
+    found = there & (said.probability > 0.5) & (error < WITHIN)
+    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(said.covariance[found]), miss[found])
+    half, most = np.percentile(error[found], [50, 90]) if found.any() else (np.nan, np.nan)
     return {
-        "found": found,
-        "false": float((empty > 0.5).mean()),
+        "found": float(found.sum()) / max(int(there.sum()), 1),
+        "false": float((said.probability[~there] > 0.5).mean()),
         "error_50": float(half),
         "error_90": float(most),
         "squared": float(squared.mean()) if len(squared) else np.nan,

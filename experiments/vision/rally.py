@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,16 @@ class Played:
     unseen: int = 0
     ghosts: int = 0
 
+    def watch(self, rig: CameraRig, ball: TrackedBall | None, truth: np.ndarray | None) -> None:
+        """Takes the ball that is reported and where it is (3,) [m], None: there is none."""
+        if truth is None:
+            self.ghosts += ball is not None
+        elif all(camera.sees(truth, 5.0) for camera in rig.cameras):
+            if ball is None:
+                self.unseen += 1
+            else:
+                self.errors.append(float(np.linalg.norm(ball.position - truth)))
+
     def lines(self) -> list[str]:
         """The figures, as text."""
         count, back = len(self.outcomes), self.outcomes.count("returned")
@@ -60,7 +70,6 @@ def play(
     distribution: str,
     seed: int,
     pixels: bool,
-    report: Callable[[int], object] = lambda done: None,
 ) -> Played:
     """Balls of a distribution; with ``pixels`` by the cameras of a rig, else by the emulator's triangulation."""
     robot = robot_of(artefact)
@@ -68,24 +77,10 @@ def play(
     params = replace(robots.load_rig(None, robot), tracker=cameras, seed=seed)
     thrown = robots.throws_of(build.distribution(distribution, "--distribution"), SimModel(), POOL, seed)
     played = Played()
-    rendered = RenderedCameras(rig, detector, watch=_watcher(played, rig) if pixels else None)
+    rendered = RenderedCameras(rig, detector, watch=partial(played.watch, rig) if pixels else None)
     config = replace(STANDARD_PLAY, contract=robot.contract)
     lock_step = LockStep(robot.scene(), thrown, artefact.streaming(), params, config, rendered=rendered.open)
     lock_step.start()
     while len(played.outcomes) < balls and (found := lock_step.play(1)):
         played.outcomes.append(found[0].outcome)
-        report(len(played.outcomes))
     return played
-
-
-def _watcher(played: Played, rig: CameraRig) -> Callable[[TrackedBall | None, np.ndarray | None], None]:
-    def watch(ball: TrackedBall | None, truth: np.ndarray | None) -> None:
-        if truth is None:
-            played.ghosts += ball is not None
-        elif all(camera.sees(truth, 5.0) for camera in rig.cameras):
-            if ball is None:
-                played.unseen += 1
-            else:
-                played.errors.append(float(np.linalg.norm(ball.position - truth)))
-
-    return watch

@@ -25,6 +25,7 @@ FINER = 4  # of the table's lines, which cameras are calibrated by
 PER_STEP = 1.2  # [px] between the discs that make a streak
 
 Path = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] to the ball's places (n, 3) [m]; NaN where there is none
+Box = tuple[slice, slice]  # rows and columns
 Window = tuple[int, int, int, int]  # x, y, width, height [px], all even
 
 
@@ -47,7 +48,7 @@ class Picture(NamedTuple):
 
 @dataclass
 class Scene:
-    """A camera and all that stands still before it; the looks may be changed between frames."""
+    """A camera and all that stands still before it; exposure and ball may be changed between frames."""
 
     camera: Camera
     image: np.ndarray  # (h, w, 3) uint8, linear RGB
@@ -60,19 +61,12 @@ class Scene:
     work: np.ndarray = field(init=False)
     bayer: np.ndarray = field(init=False)
     noise: np.ndarray = field(init=False)
+    deviations: np.ndarray = field(init=False)  # (256,) [grey levels] of the noise at each level
 
     def __post_init__(self) -> None:
         self.work, self.bayer = self.image.copy(), mosaic(self.image)
-        self.noise = cv2.LUT(self.bayer, self.deviations())
-
-    def deviations(self) -> np.ndarray:
-        """Standard deviation (256,) [grey levels] of the noise at each level, for ``gain`` and ``brightness``."""
-        return np.sqrt(self.gain * self.brightness * np.arange(256) + READ_NOISE).astype(np.float32)
-
-    def relight(self, gain: float, brightness: float) -> None:
-        """Changes the light: gain of the noise, and a factor on all levels."""
-        self.gain, self.brightness = gain, brightness
-        self.noise = cv2.LUT(self.bayer, self.deviations())
+        self.deviations = np.sqrt(self.gain * self.brightness * np.arange(256) + READ_NOISE).astype(np.float32)
+        self.noise = cv2.LUT(self.bayer, self.deviations)
 
 
 def mosaic(image: np.ndarray) -> np.ndarray:
@@ -106,7 +100,7 @@ def draw_polygon(
         whole = np.clip(np.round(pixels * 16), -(2**20), 2**20).astype(np.int32)
         cv2.fillPoly(image, [whole], [float(v) for v in colour], cv2.LINE_AA, 4)
         return
-    box = _clip_box(pixels.min(0) - 1, pixels.max(0) + 1, image.shape[1], image.shape[0])
+    box = _clip_box(pixels.min(0) - 1, pixels.max(0) + 1, image)
     if box is None:
         return
     height, width = (side.stop - side.start for side in box)
@@ -167,15 +161,15 @@ def _draw_surroundings(image: np.ndarray, camera: Camera, rng: np.random.Generat
 
 
 def _draw_table(image: np.ndarray, camera: Camera, colour: np.ndarray) -> None:
-    x, y, line = c.TABLE_WIDTH / 2, c.TABLE_LENGTH / 2, 0.02
-    draw_polygon(image, camera, [(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], colour, FINER)
-    white = (225.0,) * 3
-    for u in (-x, x - line):
-        draw_polygon(image, camera, [(u, -y, 0), (u + line, -y, 0), (u + line, y, 0), (u, y, 0)], white, FINER)
-    for v in (-y, y - line):
-        draw_polygon(image, camera, [(-x, v, 0), (x, v, 0), (x, v + line, 0), (-x, v + line, 0)], white, FINER)
-    middle = [(-0.0015, -y, 0), (0.0015, -y, 0), (0.0015, y, 0), (-0.0015, y, 0)]
-    draw_polygon(image, camera, middle, (200.0,) * 3, FINER)
+    x, y, line, white = c.TABLE_WIDTH / 2, c.TABLE_LENGTH / 2, 0.02, np.full(3, 225.0)
+    for left, right, near, far, shade in (
+        (-x, x, -y, y, colour),
+        *((u, u + line, -y, y, white) for u in (-x, x - line)),
+        *((-x, x, v, v + line, white) for v in (-y, y - line)),
+        (-0.0015, 0.0015, -y, y, np.full(3, 200.0)),
+    ):
+        corners = [(left, near, 0), (right, near, 0), (right, far, 0), (left, far, 0)]
+        draw_polygon(image, camera, corners, shade, FINER)
 
 
 def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
@@ -216,10 +210,10 @@ class Actors:
     def __init__(self, rng: np.random.Generator, clutter: int = 4, dressed: bool = False) -> None:
         self.at, self.phase, self.pace = rng.uniform(-0.5, 0.5), rng.uniform(0, 6.3, 4), rng.uniform(3, 9)
         self.far = rng.uniform(1.6, 2.3)
-        self.shirt = np.full(3, rng.uniform(170, 250)) if rng.random() < 0.5 else rng.uniform(0, 200, 3)
-        self.skin = np.array([215, 150, 110.0]) * rng.uniform(0.35, 1.05)
+        shirt = np.full(3, rng.uniform(170, 250)) if rng.random() < 0.5 else rng.uniform(0, 200, 3)
+        skin = np.array([215, 150, 110.0]) * rng.uniform(0.35, 1.05)
         self.robot = np.array([(225, 105, 30), (220, 220, 215), (40, 40, 45)][rng.integers(3)])
-        self.trousers, self.hair = rng.uniform(0, 120, 3), rng.uniform(0, 90, 3)
+        trousers, hair = rng.uniform(0, 120, 3), rng.uniform(0, 90, 3)
         self.rubber = np.array([(150, 20, 20), (20, 20, 20), (30, 60, 150)][rng.integers(3)])
         self.logos = [
             (rng.uniform([-0.12, 0.2], [0.12, 0.55]), rng.uniform(0, 0.05),
@@ -231,17 +225,17 @@ class Actors:
             radius = rng.uniform(0.004, 0.035)
             way = rng.normal(size=3)
             length = way / np.linalg.norm(way) * radius * rng.uniform(2.5, 9)  # longer than any ball's streak is wide
-            colour = (ORANGE, WHITE, self.skin)[rng.integers(3)] if rng.random() < 0.5 else rng.uniform(0, 255, 3)
+            colour = (ORANGE, WHITE, skin)[rng.integers(3)] if rng.random() < 0.5 else rng.uniform(0, 255, 3)
             middle = rng.uniform([-1.0, -1.6, -0.1], [1.0, 2.0, 0.8])
             self.things.append(
                 (middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3))
             )
-
-        parts = {"shirt": self.shirt, "trousers": self.trousers, "skin": self.skin, "hair": self.hair}
-        self.textures = {name: _weave(colour, rng) for name, colour in parts.items()} if dressed else {}
+        parts = {"shirt": shirt, "trousers": trousers, "skin": skin, "hair": hair}
+        # Colour and texture of each part.
+        self.dress = {name: (colour, _weave(colour, rng) if dressed else None) for name, colour in parts.items()}
 
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
-        """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
+        """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near, None or NaN: none is."""
         swing = np.sin(self.pace * time + self.phase)
         wrist = np.array([-self.at + 0.4 * swing[3], -1.75 + 0.1 * swing[1], 0.25 + 0.15 * swing[0]])
         if ball is not None and ball[1] < -1.2:
@@ -262,23 +256,16 @@ class Actors:
         hand = np.array([x + 0.35 + 0.25 * swing[2], y - 0.45 + 0.2 * swing[3], 0.25 + 0.2 * swing[2]])
         if ball is not None and ball[1] > self.far - 0.9:
             hand = hand + (ball + [0, 0.08, 0] - hand) * min(1.0, (ball[1] - self.far + 0.9) / 0.5)
-        shoulder = np.array([x + 0.2, y - 0.1, 0.55])
-        blade, left = np.array([0.02, 0, 0.03]), np.array([x - 0.22, y - 0.1, 0.55])
+        shoulder, left = np.array([x + 0.2, y - 0.1, 0.55]), np.array([x - 0.22, y - 0.1, 0.55])
         shapes = [
-            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
-            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
-            Capsule(hip, neck, 0.17, self.shirt, self.textures.get("shirt")),
-            Capsule(head, head, 0.1, self.skin, self.textures.get("skin")),
-            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, self.hair, self.textures.get("hair")),
-            Capsule(
-                left,
-                left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]],
-                0.04,
-                self.skin,
-                self.textures.get("skin"),
-            ),
-            Capsule(shoulder, hand, 0.045, self.skin, self.textures.get("skin")),
-            Capsule(hand, hand + blade, 0.075, self.rubber),
+            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, *self.dress["trousers"]),
+            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, *self.dress["trousers"]),
+            Capsule(hip, neck, 0.17, *self.dress["shirt"]),
+            Capsule(head, head, 0.1, *self.dress["skin"]),
+            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, *self.dress["hair"]),
+            Capsule(left, left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]], 0.04, *self.dress["skin"]),
+            Capsule(shoulder, hand, 0.045, *self.dress["skin"]),
+            Capsule(hand, hand + [0.02, 0, 0.03], 0.075, self.rubber),
         ]
         for (u, v), wide, radius, colour in self.logos:
             spot = np.array([x + u, y - 0.27, v])
@@ -327,40 +314,32 @@ def render(
     spot = float(camera.depth(places).mean()) if len(places) else -1.0
     if spot < NEAREST:
         places, spot = places[:0], -1.0
-    drawn: list[tuple[slice, slice]] = []
-    ordered = []
-    if shapes:
-        ends = np.array([(s.start, s.end) for s in shapes])
-        depths, pixels = camera.depth(ends), camera.project(ends)
-        for shape, depth, pair in zip(shapes, depths, pixels, strict=True):
-            if depth.min() > NEAREST:
-                ordered.append(
-                    (float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape)
-                )
-    ordered.sort(key=lambda s: -s[0])
-    farther = sum(depth >= spot for depth, *_ in ordered)
-    for _, pair, radius, shape in ordered[:farther]:
-        drawn += _draw_capsule(image, pair, radius, shape)
+    ends = np.array([(s.start, s.end) for s in shapes]).reshape(-1, 2, 3)
+    depths, pixels = camera.depth(ends), camera.project(ends) - origin
+    middles, radii = depths.mean(1), [camera.matrix[0, 0] * s.radius for s in shapes]
+    order = [i for i in np.argsort(-middles, kind="stable") if depths[i].min() > NEAREST]
+    farther = sum(middles[i] >= spot for i in order)
     seen, patch = 0.0, None
+    boxes = [_draw_capsule(image, pixels[i], radii[i] / middles[i], shapes[i]) for i in order[:farther]]
     if len(places):
-        shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
+        boxes.append(_draw_shadow(scene, image, places[len(places) // 2], origin))
         seen, patch = _draw_ball(scene, image, places, origin)
-        drawn += [box for box in (shadow, patch) if box is not None]
-    for _, pair, radius, shape in ordered[farther:]:
+        boxes.append(patch)
+    for i in order[farther:]:
         before = image[patch].copy() if patch else None
-        drawn += _draw_capsule(image, pair, radius, shape)
+        boxes.append(_draw_capsule(image, pixels[i], radii[i] / middles[i], shapes[i]))
         if patch and before is not None:
             seen *= 1.0 - float((before != image[patch]).any(-1).mean())
-    bayer, deviation, table = scene.bayer[view], scene.noise[view], scene.deviations()
+    drawn = [box for box in boxes if box is not None]
+    bayer, deviation = scene.bayer[view], scene.noise[view]
     if drawn:
         bayer, deviation = bayer.copy(), deviation.copy()
     still = scene.image[view]
     for rows, columns in drawn:
         # The colours of a quad are where they are in the whole frame.
-        even = (slice(side.start // 2 * 2, (side.stop + 1) // 2 * 2) for side in (rows, columns))
-        box = tuple(even)
+        box = tuple(slice(side.start // 2 * 2, (side.stop + 1) // 2 * 2) for side in (rows, columns))
         bayer[box] = mosaic(image[box])
-        deviation[box] = cv2.LUT(bayer[box], table)
+        deviation[box] = cv2.LUT(bayer[box], scene.deviations)
     for box in drawn:
         image[box] = still[box]
     bank = noise_bank(camera.size[1], camera.size[0])
@@ -369,16 +348,16 @@ def render(
     return Picture(cv2.addWeighted(bayer, scene.brightness, noise, 1.0, 0.0, dtype=cv2.CV_8U), seen)
 
 
-def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, shape: Capsule) -> list[tuple[slice, slice]]:
-    """Draws a line (2, 2) [px] with round ends; the box that it covers, in a list, which is empty outside."""
-    box = _clip_box(pair.min(0) - radius - 2, pair.max(0) + radius + 2, image.shape[1], image.shape[0])
+def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, shape: Capsule) -> Box | None:
+    """Draws a line (2, 2) [px] with round ends; the box that it covers, None outside."""
+    box = _clip_box(pair.min(0) - radius - 2, pair.max(0) + radius + 2, image)
     if box is None:
-        return []
+        return None
     a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
     width = max(1, int(2 * radius))
     if shape.texture is None:
         cv2.line(image, a, b, [float(v) for v in shape.colour], width, cv2.LINE_AA, 4)
-        return [box]
+        return box
     inside = np.zeros(image.shape[:2], np.uint8)
     cv2.line(inside, a, b, 255.0, width, cv2.LINE_8, 4)
     rows, columns = (np.arange(side.start, side.stop) for side in box)
@@ -387,26 +366,24 @@ def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, shape: Cap
     cloth = shape.texture[((rows - v) % len(shape.texture))[:, None], (columns - u) % shape.texture.shape[1]]
     chosen = inside[box] > 0
     image[box][chosen] = cloth[chosen]
-    return [box]
+    return box
 
 
-def _clip_box(low: np.ndarray, high: np.ndarray, width: int, height: int) -> tuple[slice, slice] | None:
+def _clip_box(low: np.ndarray, high: np.ndarray, image: np.ndarray) -> Box | None:
     """Rows and columns of a box of pixels within a picture, or None where they do not meet."""
+    height, width = image.shape[:2]
     x0, x1 = max(int(low[0]), 0), min(int(high[0]) + 2, width)
     y0, y1 = max(int(low[1]), 0), min(int(high[1]) + 2, height)
     return (slice(y0, y1), slice(x0, x1)) if x1 - x0 > 1 and y1 - y0 > 1 else None
 
 
-def _draw_shadow(scene: Scene, image: np.ndarray, ball: np.ndarray, origin: np.ndarray) -> tuple[slice, slice] | None:
+def _draw_shadow(scene: Scene, image: np.ndarray, ball: np.ndarray, origin: np.ndarray) -> Box | None:
     """The shadow on the table, right below the ball."""
     if abs(ball[0]) > c.TABLE_WIDTH / 2 or abs(ball[1]) > c.TABLE_LENGTH / 2 or ball[2] < 0:
         return None
-    foot = np.array([ball[0], ball[1], 0.0])
-    spot, radius = (
-        scene.camera.project(foot) - origin,
-        scene.camera.matrix[0, 0] * c.BALL_RADIUS / scene.camera.depth(foot),
-    )
-    box = _clip_box(spot - 2 * radius - 3, spot + 2 * radius + 3, image.shape[1], image.shape[0])
+    camera, foot = scene.camera, np.array([ball[0], ball[1], 0.0])
+    spot, radius = camera.project(foot) - origin, camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(foot)
+    box = _clip_box(spot - 2 * radius - 3, spot + 2 * radius + 3, image)
     if box is not None:
         ys, xs = np.mgrid[box]
         inside = np.clip(1.5 - np.hypot(xs - spot[0], (ys - spot[1]) * 1.7) / radius, 0, 1)[..., None]
@@ -414,17 +391,11 @@ def _draw_shadow(scene: Scene, image: np.ndarray, ball: np.ndarray, origin: np.n
     return box
 
 
-def _draw_ball(
-    scene: Scene, image: np.ndarray, places: np.ndarray, origin: np.ndarray
-) -> tuple[float, tuple[slice, slice] | None]:
+def _draw_ball(scene: Scene, image: np.ndarray, places: np.ndarray, origin: np.ndarray) -> tuple[float, Box | None]:
     """Draws the exposure's streak; share of it that the net and the picture's edge leave, and the box it covers."""
-    camera = scene.camera
-    pixels, radius = (
-        camera.project(places) - origin,
-        float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean()),
-    )
-    low, high = pixels.min(0) - radius - 3, pixels.max(0) + radius + 3
-    box = _clip_box(low, high, image.shape[1], image.shape[0])
+    camera, pixels = scene.camera, scene.camera.project(places) - origin
+    radius = float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean())
+    box = _clip_box(pixels.min(0) - radius - 3, pixels.max(0) + radius + 3, image)
     if box is None:
         return 0.0, None
     steps = max(2, int(np.linalg.norm(np.diff(pixels, axis=0), axis=1).sum() / PER_STEP) + 1)

@@ -25,13 +25,11 @@ class RenderedCameras:
 
     rig        the cameras
     detector   folder of the network
-    believed   the cameras as their calibration has them; None: it is perfect
     watch      is told of every frame the reported ball, and where it is [m] (3,); None: there is none
     """
 
     rig: CameraRig
     detector: Path
-    believed: CameraRig | None = None
     watch: Callable[[TrackedBall | None, np.ndarray | None], None] | None = None
 
     def open(self, params: TrackerParams, world: World, seed: int) -> RenderedTracker:
@@ -50,13 +48,9 @@ class RenderedTracker(EmulatedTracker):
             scene.exposure, scene.ball = rig.exposure, self._scenes[0].ball
         self._person = pictures.Actors(self._random, clutter=0)
         self._detectors = [Detector(cameras.detector, params.rate) for _ in rig.cameras]
-        self.tracker = BallTracker((cameras.believed or rig).cameras)
-        model = world.model
-        self._capsules = [
-            i
-            for i in range(model.ngeom)
-            if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE and model.geom_bodyid[i] > 0
-        ]
+        self.tracker = BallTracker(rig.cameras)
+        is_capsule = world.model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._capsules = np.flatnonzero(is_capsule & (world.model.geom_bodyid > 0))
 
     def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
         """Exposes a frame in whose middle the ball is at a position (3,) [m], or nowhere; its number is not seen."""
@@ -69,25 +63,23 @@ class RenderedTracker(EmulatedTracker):
 
         shapes = [*self._person.person(now, position), *self._robot()]
         guesses = self.tracker.guesses(now)
-        found = []
-        for scene, detector, places in zip(self._scenes, self._detectors, guesses, strict=True):
-            frame = pictures.render(scene, path, now, self._random, shapes).frame
-            found.append(detector.detect(frame, places))
+        found = [
+            detector.detect(pictures.render(scene, path, now, self._random, shapes).frame, places)
+            for scene, detector, places in zip(self._scenes, self._detectors, guesses, strict=True)
+        ]
         tracked = self.tracker.update(now, found)
         if self._watch is not None:
             self._watch(tracked, position)
-        seen: tuple[np.ndarray, ...] = ()
         if tracked is not None and tracked.seen:
-            seen = tracked.position, tracked.velocity, tracked.covariance
-        self._send(now, self.tracker.number, now, *(seen or (None,)))
+            self._send(now, tracked.number, now, tracked.position, tracked.velocity, tracked.covariance)
+        else:
+            self._send(now, self.tracker.number, now, None)
 
     def _robot(self) -> list[pictures.Capsule]:
         """The robot's capsules, and its blade."""
-        model, data = self._world.model, self._world.data
-        shapes = []
+        model, data, shapes = self._world.model, self._world.data, []
         for i in self._capsules:
-            half = data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]
-            place = data.geom_xpos[i]
+            place, half = data.geom_xpos[i], data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]
             shapes.append(pictures.Capsule(place - half, place + half, float(model.geom_size[i, 0]), PAINT))
         blade = data.site("paddle").xpos.copy()
         return [*shapes, pictures.Capsule(blade, blade + [0.0, 0.01, 0.0], BLADE, RUBBER)]

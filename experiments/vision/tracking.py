@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from experiments.vision import evaluation
 from experiments.vision.crops import SEEN
+from experiments.vision.evaluation import EDGE, LEAD, play_flights, spread
 from robot_io.vision.detector import Detector
 from robot_io.vision.rig import CameraRig
 from robot_io.vision.tracker import BallTracker
@@ -18,7 +17,7 @@ SOON = (0.03, 0.06)  # [s] after the stroke in which velocities are judged
 DIFFERENCE = 5e-4  # [s]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Tracked:
     """What came of flights.
 
@@ -29,21 +28,21 @@ class Tracked:
     ghosts    stereo frames before there was a ball in which one was reported
     """
 
-    places: np.ndarray
-    speeds: np.ndarray
-    soon: np.ndarray
-    acquired: np.ndarray
-    missed: int
-    ghosts: int
+    places: list[float] = field(default_factory=list)
+    speeds: list[float] = field(default_factory=list)
+    soon: list[float] = field(default_factory=list)
+    acquired: list[float] = field(default_factory=list)
+    missed: int = 0
+    ghosts: int = 0
 
     def lines(self) -> list[str]:
         """The figures, as text."""
-        if not len(self.places):
+        if not self.places:
             return ["no ball was tracked"]
-        place = " / ".join(f"{1e3 * v:.2f}" for v in np.percentile(self.places, [50, 90, 99]))
-        speed = " / ".join(f"{v:.3f}" for v in np.percentile(self.speeds, [50, 90, 99]))
-        soon = " / ".join(f"{v:.3f}" for v in np.percentile(self.soon, [50, 90])) if len(self.soon) else "none"
-        within = " / ".join(f"{(self.acquired <= limit + 1e-6).mean():.3f}" for limit in (0.024, 0.032, 0.06))
+        place, speed = spread(1e3 * np.array(self.places)), spread(self.speeds, ".3f")
+        soon = spread(self.soon, ".3f", (50, 90)) if self.soon else "none"
+        acquired = np.array(self.acquired)
+        within = " / ".join(f"{(acquired <= limit + 1e-6).mean():.3f}" for limit in (0.024, 0.032, 0.06))
         return [
             f"{len(self.places)} stereo frames with a tracked ball, {self.missed} missed, {self.ghosts} ghosts",
             f"place 50 / 90 / 99 %: {place} mm",
@@ -54,12 +53,7 @@ class Tracked:
 
 
 def evaluate_tracker(
-    folder: Path,
-    rig: CameraRig,
-    believed: CameraRig,
-    tracks: np.ndarray,
-    rng: np.random.Generator,
-    report: Callable[[int], object] = lambda done: None,
+    folder: Path, rig: CameraRig, believed: CameraRig, tracks: np.ndarray, rng: np.random.Generator
 ) -> Tracked:
     """Flights seen by the cameras of a rig, tracked with the cameras that a calibration believes in.
 
@@ -69,12 +63,9 @@ def evaluate_tracker(
         believed: the same as calibrated.
         tracks: flights (n, m, 3) [m] at 1 kHz.
         rng: draws halls, people and noise.
-        report: is told how many flights are done.
     """
-    places, speeds, soon, acquired = [], [], [], []
-    missed = ghosts = 0
-    flights = evaluation.play_flights(rig.cameras, tracks, rng, rig.rate, rig.exposure)
-    for number, flight in enumerate(flights):
+    tracked = Tracked()
+    for flight in play_flights(rig.cameras, tracks, rng, rig.rate, rig.exposure):
         detectors = [Detector(folder, rig.rate) for _ in rig.cameras]
         tracker = BallTracker(believed.cameras)
         first, got = None, np.inf
@@ -84,22 +75,21 @@ def evaluate_tracker(
             ball = tracker.update(time, found)
             truth = path(np.array([time - DIFFERENCE, time, time + DIFFERENCE]))
             if np.isnan(truth).any():
-                ghosts += ball is not None and first is None
+                tracked.ghosts += ball is not None and first is None
                 continue
-            sees = [camera.sees(truth[1], evaluation.EDGE) for camera in rig.cameras]
-            if not all(sees) or min(shot.seen for shot in shots) <= SEEN or count < evaluation.LEAD:
+            sees = [camera.sees(truth[1], EDGE) for camera in rig.cameras]
+            if not all(sees) or min(shot.seen for shot in shots) <= SEEN or count < LEAD:
                 continue
             first = time if first is None else first
             if ball is None:
-                missed += got < np.inf
+                tracked.missed += got < np.inf
                 continue
             got = min(got, time - first)
             velocity = (truth[2] - truth[0]) / (2 * DIFFERENCE)
-            places.append(float(np.linalg.norm(ball.position - truth[1])))
-            speeds.append(float(np.linalg.norm(ball.velocity - velocity)))
+            tracked.places.append(float(np.linalg.norm(ball.position - truth[1])))
+            tracked.speeds.append(float(np.linalg.norm(ball.velocity - velocity)))
             if SOON[0] <= time - first < SOON[1]:
-                soon.append(speeds[-1])
+                tracked.soon.append(tracked.speeds[-1])
         if first is not None:
-            acquired.append(got)
-        report(number + 1)
-    return Tracked(np.array(places), np.array(speeds), np.array(soon), np.array(acquired), missed, ghosts)
+            tracked.acquired.append(got)
+    return tracked

@@ -80,11 +80,7 @@ class Section:
 
     key: str
     heading: str
-    parts: list[str] = field(default_factory=list)
-
-    @property
-    def html(self) -> Markup:
-        return Markup("\n".join(self.parts))
+    parts: list[Markup] = field(default_factory=list)
 
 
 class Page:
@@ -104,7 +100,7 @@ class Page:
 
     def add(self, html: str) -> None:
         """Adds HTML to the section."""
-        self.sections[-1].parts.append(str(html))
+        self.sections[-1].parts.append(Markup(html))
 
     def paragraph(self, text: str, css: str = "") -> None:
         """Adds plain text."""

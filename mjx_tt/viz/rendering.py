@@ -1,27 +1,35 @@
 """Pictures and videos of the table, the robot, the ball and the person's place, made without a display.
 
+A line of text below says which ball it is, what became of it, how fast it was.
+
 Ball and trail are two colours, bright within dark, so that one of them stands out from whatever lies behind: both
 rubbers, table, net, floor, sky. The ball is drawn larger than it is.
+
+OpenGL's back end is the one that MUJOCO_GL names (egl, osmesa, glfw or cgl), or else the first that works of those
+usual on this system. It is chosen when the first picture is made, so it does not matter when MuJoCo was imported.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
+import platform
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.robot.mjcf import load_model
-from mjx_tt.viz.caption import Caption
-from mjx_tt.viz.opengl import offscreen
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
 CAMERA = "human"
@@ -38,7 +46,51 @@ _GIF_TICK = 0.01  # [s], the format's unit of time
 _GIF_MIN_DELAY = 0.02  # [s], viewers slow down frames that are shorter than this
 _GIF_COLOURS = 128
 
+CAPTION_HEIGHT = 1 / 13  # of the picture's
+BACKGROUND, PLAIN, FAINT = (20, 24, 32), (255, 255, 255), (176, 186, 200)
+GOOD, POOR = (122, 222, 142), (255, 160, 122)
+
+_BACKENDS = {"Linux": ("egl", "osmesa"), "Darwin": ("cgl",), "Windows": ("glfw",)}
+_KNOWN_BACKENDS = ("egl", "osmesa", "glfw", "cgl")
+_NO_BACKEND = (
+    "no OpenGL back end for rendering without a display: tried {}. On Debian or Ubuntu install EGL (apt-get install "
+    "libegl1 libgl1 libgl1-mesa-dri) or OSMesa (apt-get install libosmesa6)"
+)
+
+Colour = tuple[float, float, float]
 NO_PATH = np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class Caption:
+    """Text from the left: ``title``, ``text`` in ``colour`` (RGB, 0 to 255); ``note`` at the right end."""
+
+    title: str
+    text: str = ""
+    note: str = ""
+    colour: tuple[int, int, int] = PLAIN
+
+    def written_on(self, frame: np.ndarray) -> np.ndarray:
+        """Copy of a picture (height, width, 3) uint8 with the text over its lowest thirteenth."""
+        image = Image.fromarray(frame)
+        bar = max(1, round(image.height * CAPTION_HEIGHT))
+        top, gap = image.height - bar, 0.45 * bar
+        pen = ImageDraw.Draw(image)
+        pen.rectangle((0, top, image.width, image.height), fill=BACKGROUND)
+        parts = ((self.title, PLAIN), (self.text, self.colour), (self.note, FAINT))
+        font = ImageFont.load_default(0.55 * bar)
+        widths = [pen.textlength(text, font) for text, _ in parts]
+        room = image.width - gap * (1 + sum(bool(text) for text, _ in parts))
+        if sum(widths) > room:  # all of it, in a smaller size
+            font = ImageFont.load_default(0.55 * bar * room / sum(widths))
+            widths = [pen.textlength(text, font) for text, _ in parts]
+        x = gap
+        for (text, colour), width in zip(parts[:2], widths[:2], strict=True):
+            if text:
+                pen.text((x, top + bar / 2), text, colour, font, anchor="lm")
+                x += width + gap
+        pen.text((image.width - gap, top + bar / 2), self.note, FAINT, font, anchor="rm")
+        return np.asarray(image)
 
 
 @dataclass(frozen=True)
@@ -149,6 +201,43 @@ def render_frames(
             yield frame if moment.caption is None else moment.caption.written_on(frame)
 
 
+@contextmanager
+def offscreen(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[mujoco.MjrContext]:
+    """A current OpenGL context of this size with the model's meshes and textures; freed on exit."""
+    chosen = backend()
+    try:
+        gl = importlib.import_module(f"mujoco.{chosen}").GLContext(*size)
+        gl.make_current()
+    except Exception as error:  # PyOpenGL raises whatever its failed look-up happens to hit
+        raise RuntimeError(_NO_BACKEND.format(chosen)) from error
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    try:
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        yield context
+    finally:
+        context.free()
+        gl.free()
+
+
+@cache
+def backend() -> str:
+    """MUJOCO_GL, or else the first of this system's back ends that makes a context.
+
+    A back end is tried in a process of its own: PyOpenGL binds to one for the life of a process, even when it fails.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if asked in _KNOWN_BACKENDS:
+        return asked
+    if asked:
+        raise RuntimeError(f"MUJOCO_GL={asked!r} cannot render without a display; use one of {_KNOWN_BACKENDS}")
+    candidates = _BACKENDS.get(platform.system(), ("glfw",))
+    for name in candidates:
+        attempt = f"from mujoco.{name} import GLContext; GLContext(8, 8).make_current()"
+        if len(candidates) == 1 or not subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode:
+            return name
+    raise RuntimeError(_NO_BACKEND.format(", ".join(candidates)))
+
+
 def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
     """Names of the cameras of the model, by default the table-tennis scene."""
     model = load_model() if model is None else model
@@ -195,8 +284,7 @@ def _add_ball(scene: mujoco.MjvScene, eye: np.ndarray, moment: Moment) -> None:
         _add_disc(scene, eye, _behind(eye, dot), _DOT_RADIUS + EDGE, DARK)
     if np.isfinite(moment.ball).all():
         _add_disc(scene, eye, moment.ball, RING_RADIUS, DARK)
-        sphere = np.full(3, SHOWN_RADIUS)
-        ball = _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, sphere, moment.ball, np.eye(3), BRIGHT)
+        ball = _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, [SHOWN_RADIUS] * 3, moment.ball, np.eye(3), BRIGHT)
         ball.category = mujoco.mjtCatBit.mjCAT_DYNAMIC  # casts a shadow
 
 
@@ -209,41 +297,34 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-def _add_disc(
-    scene: mujoco.MjvScene, eye: np.ndarray, place: np.ndarray, radius: float, rgb: tuple[float, float, float]
-) -> None:
+def _add_disc(scene: mujoco.MjvScene, eye: np.ndarray, place: np.ndarray, radius: float, rgb: Colour) -> None:
     towards = _unit(eye - place)
     across = _unit(np.cross(towards, [0.0, 0.0, 1.0]))
     frame = np.stack([across, np.cross(towards, across), towards], axis=1)
-    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([radius, _FLAT, 0.0]), place, frame, rgb)
+    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, _FLAT, 0.0), place, frame, rgb)
 
 
 def _add_ribbon(
-    scene: mujoco.MjvScene,
-    eye: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    half_width: float,
-    rgb: tuple[float, float, float],
+    scene: mujoco.MjvScene, eye: np.ndarray, start: np.ndarray, end: np.ndarray, half_width: float, rgb: Colour
 ) -> None:
     middle, along = 0.5 * (start + end), _unit(end - start)
     across = _unit(np.cross(along, eye - middle))
     frame = np.stack([along, across, np.cross(along, across)], axis=1)
     length = 0.5 * float(np.linalg.norm(end - start)) + 0.5 * half_width  # no gaps where the path bends
-    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, np.array([length, half_width, _FLAT]), middle, frame, rgb)
+    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, (length, half_width, _FLAT), middle, frame, rgb)
 
 
 def _add(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
-    size: np.ndarray,
+    size: Sequence[float],
     place: np.ndarray,
     frame: np.ndarray,
-    rgb: tuple[float, float, float],
+    rgb: Colour,
 ) -> mujoco.MjvGeom:
     """Appends a geom that shines in its colour whatever the light, and casts no shadow."""
     geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, size, place, frame.ravel(), np.array([*rgb, 1.0], np.float32))
+    mujoco.mjv_initGeom(geom, kind, np.array(size), place, frame.ravel(), np.array([*rgb, 1.0], np.float32))
     geom.category, geom.emission, geom.specular = mujoco.mjtCatBit.mjCAT_DECOR, 0.8, 0.0
     scene.ngeom += 1
     return geom

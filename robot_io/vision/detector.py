@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from robot_io.vision.detection import Detection
+from robot_io.vision.triangulation import Detection
 
 SIZE = 64  # [px] of a window: fine at full, coarse at half resolution
 AROUND = SIZE // 2  # [px] by which the coarse window is larger on each side
@@ -30,6 +30,7 @@ FRAMES = 3  # that are looked at together
 QUARTER = 4  # px of a frame per pixel of the search's pictures
 PLACE = 4  # [quarter px] a place reaches to each side of its middle
 CANDIDATES = 24  # places that the classifier orders
+WINDOWS = 3  # that the search may fill
 PLAUSIBLE = -3.0  # least score of a place, the logarithm of the odds of a ball, for a window
 CHANGE = (4, 3)  # least change of a place [grey levels], and times the median change
 APART = 12.0  # [px] between two balls, or two windows
@@ -48,6 +49,17 @@ def shrink(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     red = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
     both = [cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for picture in (half, red)]
     return half, cv2.merge(both)
+
+
+def widen(picture: np.ndarray, by: int) -> np.ndarray:
+    """A picture (h, w, ...) with its border repeated ``by`` pixels to each side."""
+    return cv2.copyMakeBorder(picture, by, by, by, by, cv2.BORDER_REPLICATE)
+
+
+def cut_windows(frames: Sequence[np.ndarray], corner: np.ndarray) -> np.ndarray:
+    """Windows (n, SIZE, SIZE) of frames (h, w), whose corner is at x and y (2,)."""
+    x, y = corner
+    return np.stack([frame[y : y + SIZE, x : x + SIZE] for frame in frames])
 
 
 def describe_places(small: Sequence[np.ndarray], middles: np.ndarray) -> np.ndarray:
@@ -147,43 +159,34 @@ class Detector:
     Args:
         folder: where the network and the search's classifier are.
         rate: frames a second [Hz].
-        most: windows that the search may fill.
         threshold: least probability of what is reported.
         bayer: order of the frames' colours.
     """
 
-    def __init__(
-        self,
-        folder: str | Path,
-        rate: float = 125.0,
-        most: int = 3,
-        threshold: float = 0.5,
-        bayer: str = "RGGB",
-    ) -> None:
+    def __init__(self, folder: str | Path, rate: float = 125.0, threshold: float = 0.5, bayer: str = "RGGB") -> None:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._network, self._order = (
             onnxruntime.InferenceSession(str(Path(folder) / name), options, providers=["CPUExecutionProvider"])
             for name in (NETWORK, SEARCH)
         )
-        self.rate, self.most, self.threshold = rate, most, threshold
+        self.rate, self.threshold = rate, threshold
         self._cut = np.array(CUT[bayer])
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins anew, as after frames were lost."""
         self._frames: list[np.ndarray] = []
         self._half: list[np.ndarray] = []
         self._small: list[np.ndarray] = []
         self._expected: list[np.ndarray] = []
 
-    def forget(self) -> None:
-        """Begins anew, as after frames were lost."""
-        self._frames, self._half, self._small, self._expected = [], [], [], []
-
-    def detect(self, frame: np.ndarray, guesses: Sequence[np.ndarray] = (), search: bool = True) -> list[Detection]:
+    def detect(self, frame: np.ndarray, guesses: Sequence[np.ndarray] = ()) -> list[Detection]:
         """Balls in a frame, the surest first; none in the first two frames.
 
         Args:
             frame: (h, w) uint8; no copy is made, so it must not be overwritten for three frames.
             guesses: pixels (2,) where a ball is expected.
-            search: also look where the picture changes; else only at the guesses.
 
         Raises:
             ValueError: the frame is no such array, or of another size than the last one.
@@ -193,11 +196,7 @@ class Detector:
             return []
         middles: list[np.ndarray] = []
         extent = np.array(self._frames[0].shape[::-1])
-        for middle in [
-            *(guess - self._cut for guess in guesses),
-            *(self._expected if search else ()),
-            *(self._search() if search else ()),
-        ]:
+        for middle in [*(guess - self._cut for guess in guesses), *self._expected, *self._search()]:
             inside = (middle > -APART).all() and (middle < extent + APART).all()
             if inside and _is_apart(middle, middles):
                 middles.append(middle)
@@ -212,15 +211,14 @@ class Detector:
                 f"{frame.shape}; give the raw Bayer frame"
             )
         left, top = self._cut
-        height, width = ((side - cut) // QUARTER * QUARTER for side, cut in zip(frame.shape, (top, left), strict=True))
-        frame = frame[top : top + height, left : left + width]
+        frame = frame[top:, left:]
+        frame = frame[: len(frame) // QUARTER * QUARTER, : frame.shape[1] // QUARTER * QUARTER]
         if self._frames and frame.shape != self._frames[0].shape:
             raise ValueError(
                 f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera"
             )
         half, small = shrink(frame)
-        half = cv2.copyMakeBorder(half, *(AROUND // 2,) * 4, cv2.BORDER_REPLICATE)
-        small = cv2.copyMakeBorder(small, *(PLACE,) * 4, cv2.BORDER_REPLICATE)
+        half, small = (widen(picture, by) for picture, by in ((half, AROUND // 2), (small, PLACE)))
         self._frames = [frame, *self._frames[: FRAMES - 1]]
         self._half = [half, *self._half[: FRAMES - 1]]
         self._small = [small, *self._small[: FRAMES - 1]]
@@ -238,7 +236,7 @@ class Detector:
             middle = places[k, ::-1] * float(QUARTER) + (QUARTER - 1) / 2
             if _is_apart(middle, chosen):
                 chosen.append(middle)
-            if len(chosen) == self.most:
+            if len(chosen) == WINDOWS:
                 break
         return chosen
 
@@ -246,12 +244,10 @@ class Detector:
         height, width = self._frames[0].shape
         corners = np.round((np.stack(middles) - (SIZE - 1) / 2) / 2).astype(int) * 2
         corners = np.clip(corners, 0, [width - SIZE, height - SIZE])
-        fine = np.empty((len(corners), FRAMES, SIZE, SIZE), np.uint8)
-        coarse = np.empty_like(fine)
-        for i, (u, v) in enumerate(corners):
-            for t in range(FRAMES):
-                fine[i, t] = self._frames[t][v : v + SIZE, u : u + SIZE]
-                coarse[i, t] = self._half[t][v // 2 : v // 2 + SIZE, u // 2 : u // 2 + SIZE]
+        fine, coarse = (
+            np.stack([cut_windows(frames, corner // part) for corner in corners])
+            for frames, part in ((self._frames, 1), (self._half, 2))
+        )
         said = read_cells(*self._network.run(None, {"fine": fine, "coarse": coarse}))
         kept: list[Detection] = []
         for k in np.argsort(-said.probability):

@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from robot_io.vision.camera import Camera
-from robot_io.vision.detection import Detection
 from robot_io.vision.rig import CameraRig
-from robot_io.vision.triangulation import intersect
+from robot_io.vision.triangulation import Detection, intersect
 
 WINDOW = 1.0  # [s] that is judged
 SILENT = 0.1  # [s] without a frame
@@ -43,31 +43,30 @@ DRIFT = 5e-4  # [s] that stamps of frames taken together may wander apart
 
 
 @dataclass(eq=False)
-class _Lines:
-    """The table's lines in one camera's half-size picture.
+class _Eye:
+    """One camera's recent frames, and how it looked at the start."""
 
-    places  (n, m, 2) [half px] of the profiles across them
-    slopes  (n, 3) [half px/rad] by which a turn about the camera's axes moves them across
-    stills  profiles (n, m) at the start
-    """
+    camera: Camera
+    stamps: deque[float] = field(default_factory=lambda: deque(maxlen=2000))
+    light: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=2000))
+    normal: tuple[float, float] | None = None
+    stills: list[np.ndarray] = field(default_factory=list)  # profiles (n, m) at the start
+    turns: deque[float] = field(default_factory=lambda: deque(maxlen=3))  # [px]
+    looked: float = -np.inf
 
-    places: np.ndarray
-    slopes: np.ndarray
-    stills: list[np.ndarray] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, camera: Camera) -> _Lines:
-        """Of a calibrated camera."""
-        along = np.linspace(-0.95, 0.95, 24)
+    @cached_property
+    def lines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (n, m, 2) [half px] of the profiles across the table's lines, in the half-size picture; and slopes
+        (n, 3) [half px/rad] by which a turn about the camera's axes moves the lines across."""
+        along, camera = np.linspace(-0.95, 0.95, 24), self.camera
         x, y = TABLE_WIDTH / 2 - LINE / 2, TABLE_LENGTH / 2 - LINE / 2
         sides = [(np.full_like(along, sign * x), along * y) for sign in (-1, 1)]
         sides += [(along * x, np.full_like(along, sign * y)) for sign in (-1, 1)]
         points = np.concatenate([np.stack([u, v, 0.0 * u], -1) for u, v in sides])
         ways = np.repeat(np.eye(3)[[1, 1, 0, 0]], len(along), axis=0)
         seen = camera.sees(points, 16.0)
-        points, ways = points[seen], ways[seen]
         slopes, places = [], []
-        for point, way in zip(points, ways, strict=True):
+        for point, way in zip(points[seen], ways[seen], strict=True):
             jacobian = camera.jacobian(point)
             course = jacobian @ way
             normal = np.array([-course[1], course[0]]) / np.linalg.norm(course)
@@ -75,14 +74,23 @@ class _Lines:
             # A turn w of the camera moves a point in its frame by w x p.
             slopes.append(0.5 * normal @ jacobian @ camera.rotation.T @ np.cross(np.eye(3), local).T)
             places.append((camera.project(point) - 0.5) / 2.0 + ACROSS[:, None] * normal)
-        return cls(np.array(places, np.float32), np.array(slopes))
+        return np.array(places, np.float32), np.array(slopes)
 
-    def turn(self, profiles: np.ndarray) -> float:
+    def look(self, frame: np.ndarray) -> None:
+        """Adds the turn since the start, by how far the table's lines moved across their own direction."""
+        half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # colours mix
+        places, _ = self.lines
+        profiles = cv2.remap(half, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
+        if len(self.stills) < STILLS:
+            self.stills.append(profiles)
+        else:
+            self.turns.append(self._turn(profiles) * self.camera.matrix[0, 0])
+
+    def _turn(self, profiles: np.ndarray) -> float:
         """Angle [rad] by which the camera turned, from profiles (n, m) of now."""
-        was = np.mean(self.stills, axis=0)
-        slope = np.gradient(was, ACROSS, axis=1)
+        was, (_, slopes) = np.mean(self.stills, axis=0), self.lines
         shifts, trust = np.zeros(len(was)), np.zeros(len(was))
-        for i, (old, rise, new) in enumerate(zip(was, slope, profiles, strict=True)):
+        for i, (old, rise, new) in enumerate(zip(was, np.gradient(was, ACROSS, axis=1), profiles, strict=True)):
             basis = np.stack([old, rise, np.ones_like(old)], 1)  # new = gain (old - shift rise) + offset
             (gain, moved, _), *_ = np.linalg.lstsq(basis, new, rcond=None)
             if gain > 0.2 and np.ptp(old) > 10.0:
@@ -92,24 +100,11 @@ class _Lines:
         weight, turn = trust, np.zeros(3)
         for _ in range(6):  # what hides a line has no say
             root = np.sqrt(weight)[:, None]
-            turn = np.linalg.lstsq(self.slopes * root, shifts * root[:, 0], rcond=None)[0]
-            away = np.abs(shifts - self.slopes @ turn)
+            turn = np.linalg.lstsq(slopes * root, shifts * root[:, 0], rcond=None)[0]
+            away = np.abs(shifts - slopes @ turn)
             scale = max(1.5 * float(np.median(away[trust > 0])), 0.02)
             weight = trust / (1.0 + (away / (2.0 * scale)) ** 2) ** 2
         return float(np.linalg.norm(turn))
-
-
-@dataclass
-class _Eye:
-    """One camera's recent frames, and how it looked at the start."""
-
-    camera: Camera
-    stamps: deque[float] = field(default_factory=lambda: deque(maxlen=2000))
-    light: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=2000))
-    normal: tuple[float, float] | None = None
-    lines: _Lines | None = None
-    turns: deque[float] = field(default_factory=lambda: deque(maxlen=3))  # [px]
-    looked: float = -np.inf
 
 
 class Health:
@@ -133,15 +128,14 @@ class Health:
             eye.normal = tuple(np.median(np.array(eye.light)[:, 1:3], axis=0).tolist())
         if eye.normal is not None and stamp - eye.looked >= LOOK:
             eye.looked = stamp
-            self._look(eye, frame)
+            eye.look(frame)
 
     def pair(self, stamps: Sequence[float], detections: Sequence[Sequence[Detection]]) -> None:
         """Takes stamps [s] and detections of the first two cameras' frames that were taken together."""
         self._apart.append((stamps[0], stamps[1] - stamps[0]))
         if self._together is None and len(self._apart) >= SETTLE:
             self._together = float(np.median([apart for _, apart in self._apart]))
-        best = [max(seen, key=lambda d: d.probability, default=None) for seen in detections[:2]]
-        first, second = best
+        first, second = (max(seen, key=lambda d: d.probability, default=None) for seen in detections[:2])
         if first is None or second is None:
             self._last = None
             return
@@ -163,18 +157,6 @@ class Health:
         """What is wrong at a time [s] of the stamps' clock, each as a sentence with its remedy; [] nothing."""
         found = [line for eye in self._eyes for line in self._of_rate(eye, now)]
         return [*found, *self._of_light(now), *self._of_poses(), *self._of_clocks(now)]
-
-    def _look(self, eye: _Eye, frame: np.ndarray) -> None:
-        """Turns of a camera since the start, by how far the table's lines moved across their own direction."""
-        half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # colours mix
-        if eye.lines is None:
-            eye.lines = _Lines.of(eye.camera)
-        lines = eye.lines
-        profiles = cv2.remap(half, lines.places[..., 0], lines.places[..., 1], cv2.INTER_LINEAR).astype(float)
-        if len(lines.stills) < STILLS:
-            lines.stills.append(profiles)
-            return
-        eye.turns.append(lines.turn(profiles) * eye.camera.matrix[0, 0])
 
     def _of_rate(self, eye: _Eye, now: float) -> list[str]:
         name, period = eye.camera.name, 1.0 / self._rig.rate
@@ -198,8 +180,7 @@ class Health:
             _, mean, contrast, top = np.median(recent, axis=0)
             factors.append((mean / max(eye.normal[0], 1.0), contrast / max(eye.normal[1], 1.0), top))
         bright = np.array([factor[0] for factor in factors])
-        dim = (bright < DARKER).all() and bright.max() - bright.min() < 0.3
-        if dim:
+        if (bright < DARKER).all() and np.ptp(bright) < 0.3:
             return [f"light: {100 * (1 - bright.mean()):.0f} % darker in all cameras; is a lamp off?"]
         for eye, (mean, contrast, top) in zip(self._eyes, factors, strict=True):
             name = eye.camera.name

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -94,17 +93,11 @@ class FrameWriter:
         self._writer.add_message(self._channels[camera], time, compress_frame(frame), time, self._count)
         self._count += 1
 
-    def close(self) -> None:
-        """Ends the file."""
-        self._writer.finish()
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *error: object) -> None:
+        self._writer.finish()
 
 
 class FrameReader:

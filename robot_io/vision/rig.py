@@ -1,20 +1,6 @@
 """A rig's YAML: its cameras, their rate, and what ``mjx-tt vision calibrate`` found of each.
 
-    rate: 125                  [Hz] of frames
-    exposure: 0.002            [s]
-    bayer: RGGB                order of colours in the raw frames; mono: none
-    cameras:
-      left:
-        size: [1280, 1024]     width and height [px]
-        focal: [1042, 1042]    [px] along the picture's width and height
-        principal: [639.5, 511.5]
-        distortion: [-0.08, 0, 0, 0, 0]    OpenCV's k1, k2, p1, p2, k3
-        position: [-2.3, -0.9, 1.8]        [m] in the table's frame
-        rotation: [1.2, -0.6, 0.7]         rotation vector [rad] that takes the table's frame to the camera's
-        delay: 0               [s] added to its stamps, so that they are those of the first camera's clock
-        residual: 0.2          [px] root mean square of the calibration; 0: never calibrated
-
-With ``standard`` the paper's kind of placement ships: two cameras above and beside the table, in the robot's half.
+The one of ``standard`` has the paper's kind of placement: two cameras above and beside the table, in the robot's half.
 """
 
 from __future__ import annotations
@@ -105,11 +91,6 @@ class CameraRig:
     exposure: float = 0.002
     bayer: str = "RGGB"
 
-    @classmethod
-    def of(cls, cameras: tuple[Camera, ...], rate: float = 125.0, exposure: float = 0.002) -> CameraRig:
-        """A rig of cameras that share one clock and were not calibrated."""
-        return cls(cameras, (0.0,) * len(cameras), (0.0,) * len(cameras), rate, exposure)
-
 
 def read(path: str | os.PathLike) -> CameraRig:
     """The rig of a YAML file. Raises ValueError with a line for every mistake, OSError where it cannot be opened."""
@@ -135,7 +116,7 @@ def write(path: str | os.PathLike, rig: CameraRig) -> None:
     cameras = {
         camera.name: {
             "size": list(camera.size),
-            "focal": _numbers([camera.matrix[0, 0], camera.matrix[1, 1]], 4),
+            "focal": _numbers(camera.matrix.diagonal()[:2], 4),
             "principal": _numbers(camera.matrix[:2, 2], 4),
             "distortion": _numbers(camera.distortion, 7),
             "position": _numbers(camera.centre, 7),
@@ -151,5 +132,5 @@ def write(path: str | os.PathLike, rig: CameraRig) -> None:
         temporary.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120), "utf-8")
 
 
-def _numbers(values: np.ndarray | list[float], digits: int) -> list[float]:
+def _numbers(values: np.ndarray, digits: int) -> list[float]:
     return [round(float(value), digits) + 0.0 for value in values]

@@ -15,9 +15,19 @@ import numpy as np
 
 from ballmodel.kalman import Kalman, Physics
 from robot_io.vision.camera import Camera
-from robot_io.vision.detection import Detection
-from robot_io.vision.triangulation import Sight, triangulate
+from robot_io.vision.triangulation import Detection, Sight, triangulate
 
+FLOOR = 0.15  # [px] of cameras that were calibrated
+AGREE = 16.0  # squared deviation up to which two cameras see the same
+GATE, GATE_SPACE = 16.0, 21.0  # the same of a pixel, and of a place, against a prediction
+SURE, STRUCK = 0.8, 0.5  # probability of detections that begin a hypothesis; where the ball was just lost
+FAST, HITS, SLOW_HITS = 2.5, 2, 10  # [m/s] from which on so many places make a ball; slower ones need more
+SCORE, MARGIN = 7.0, 6.0  # evidence that makes a ball; by which another must have more to take its place
+SLOWEST = 1.5  # [m/s] below which nothing is a new ball: a hand, a ball that lies, a lamp
+FORGET, DROP = 0.1, 0.025  # [s] without a place after which the reported ball is given up; any other hypothesis
+ALONE = 0.05  # [s] without a place up to which one camera's sights are enough to report it as seen
+REACH = 20.0  # [m/s] within which a struck ball leaves
+MOST = 4  # hypotheses that are kept
 PHYSICS = Physics(drag=0.141, lift=0.0033, wander=0.1, bounced=(0.5, 0.25, 60.0))
 CLUTTER, FADING = 5.0, 0.9  # evidence that a place of clutter has; share of it that is left after a frame
 SUREST = 0.993  # probability beyond which more counts no more
@@ -29,42 +39,6 @@ STRIDE = 48.0  # [px] between the places where it is sought: a detector's window
 PLACES = 18  # of them, at most: a longer line has them farther apart
 SAMPLES = 256  # of a ray
 GUESSES = 2 + PLACES  # for a camera, at most: of two hypotheses, and along a ray
-
-
-@dataclass(frozen=True)
-class TrackerOptions:
-    """How much is believed.
-
-    floor      [px] deviation that calibration and lens add to every detection's
-    agree      squared deviation up to which two cameras see the same
-    gate       the same of a pixel, and ``gate_space`` of a place, against a prediction
-    sure       probability of the detections that begin a hypothesis; ``struck`` of those where the ball was just lost
-    fast       [m/s] from which on ``hits`` places make a ball; slower ones need ``slow_hits``
-    score      evidence that makes a ball, and ``margin`` by which another must have more to take its place
-    slowest    [m/s] below which nothing is a new ball: a hand, a ball that lies, a lamp
-    forget     [s] without a place after which the reported ball is given up; ``drop`` of any other hypothesis
-    alone      [s] without a place up to which one camera's sights are enough to report it as seen
-    reach      [m/s] within which a struck ball leaves
-    most       hypotheses that are kept
-    """
-
-    floor: float = 0.15
-    agree: float = 16.0
-    gate: float = 16.0
-    gate_space: float = 21.0
-    sure: float = 0.8
-    struck: float = 0.5
-    fast: float = 2.5
-    hits: int = 2
-    score: float = 7.0
-    margin: float = 6.0
-    slow_hits: int = 10
-    slowest: float = 1.5
-    forget: float = 0.1
-    drop: float = 0.025
-    alone: float = 0.05
-    reach: float = 20.0
-    most: int = 4
 
 
 @dataclass(eq=False)
@@ -111,11 +85,13 @@ class TrackedBall:
 
 @dataclass
 class BallTracker:
-    """Takes the detections of all cameras, frame by frame; the first two make places, every one corrects them."""
+    """Takes the detections of all cameras, frame by frame; the first two make places, every one corrects them.
+
+    floor  [px] deviation that calibration and lens add to every detection's
+    """
 
     cameras: tuple[Camera, ...]
-    options: TrackerOptions = TrackerOptions()
-    physics: Physics = PHYSICS
+    floor: float = FLOOR
     hypotheses: list[Hypothesis] = field(default_factory=list)
     reported: Hypothesis | None = None
     number: int = 0
@@ -153,14 +129,14 @@ class BallTracker:
         if best is None:
             return None
         mean, covariance = best.ball.mean, best.ball.covariance[:6, :6]
-        seen = best.seen == time and time - best.placed <= self.options.alone
+        seen = best.seen == time and time - best.placed <= ALONE
         return TrackedBall(self.number, mean[:3].copy(), mean[3:6].copy(), covariance.copy(), seen)
 
     def _find_sights(self, detections: Sequence[Sequence[Detection]]) -> list[Sight]:
         found = []
         for pair in product(*detections[:2]):
-            sight = triangulate(self.cameras[:2], pair, self.options.floor)
-            if sight is None or sight.deviation > self.options.agree:
+            sight = triangulate(self.cameras[:2], pair, self.floor)
+            if sight is None or sight.deviation > AGREE:
                 continue
             if (sight.point > ROOM[0]).all() and (sight.point < ROOM[1]).all():
                 found.append(sight)
@@ -169,8 +145,8 @@ class BallTracker:
     def _follow(self, h: Hypothesis, detections: Sequence[Sequence[Detection]], free: list[Sight]) -> None:
         """Corrects a hypothesis by the place that fits best, which is free no more, or by single cameras' sights."""
         fits = sorted((self._distance(h, sight), i) for i, sight in enumerate(free))
-        if fits and fits[0][0] < self.options.gate_space:
-            sight, fast = free.pop(fits[0][1]), h.speed > self.options.fast
+        if fits and fits[0][0] < GATE_SPACE:
+            sight, fast = free.pop(fits[0][1]), h.speed > FAST
             for camera, detection in zip(self.cameras, sight.detections, strict=False):
                 self._take(h, camera, detection, np.inf)
             h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
@@ -180,8 +156,8 @@ class BallTracker:
         if not any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
             for camera, seen in zip(self.cameras, detections, strict=True):
                 near = [(self._misfit(h, camera, d), i) for i, d in enumerate(seen)]
-                if near and min(near)[0] < self.options.gate:
-                    self._take(h, camera, seen[min(near)[1]], self.options.gate)
+                if near and min(near)[0] < GATE:
+                    self._take(h, camera, seen[min(near)[1]], GATE)
                     h.seen = h.time
         h.score = FADING * h.score - UNSEEN * (h.seen < h.time)
 
@@ -198,7 +174,7 @@ class BallTracker:
     def _seen(self, h: Hypothesis, camera: Camera, detection: Detection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         slope = np.zeros((2, 9))
         slope[:, :3] = camera.jacobian(h.ball.mean[:3])
-        noise = detection.covariance + self.options.floor**2 * np.eye(2)
+        noise = detection.covariance + self.floor**2 * np.eye(2)
         return detection.centre - camera.project(h.ball.mean[:3]), slope, noise
 
     def _take(self, h: Hypothesis, camera: Camera, detection: Detection, gate: float) -> None:
@@ -208,18 +184,18 @@ class BallTracker:
         noise = detection.velocity_deviation**2 * np.eye(2)
         residual = detection.velocity - slope @ h.ball.mean
         total = slope @ h.ball.covariance @ slope.T + noise
-        if float(residual @ np.linalg.solve(total, residual)) < self.options.gate:
+        if float(residual @ np.linalg.solve(total, residual)) < GATE:
             h.ball.correct(residual, slope, noise)
 
     def _begin(self, time: float, free: list[Sight]) -> None:
         """Hypotheses of places that none explains; where the reported ball was just lost, it is its stroke."""
-        options, old = self.options, self.reported
+        old = self.reported
         for sight in sorted(free, key=lambda s: -s.probability):
-            struck = old is not None and old is self.reported and 0.0 < time - old.placed <= options.drop
+            struck = old is not None and old is self.reported and 0.0 < time - old.placed <= DROP
             if struck and old is not None:
                 away = float(np.linalg.norm(sight.point - old.ball.mean[:3]))
-                struck = away < 0.03 + options.reach * (time - old.placed)
-            if sight.probability < (options.struck if struck else options.sure):
+                struck = away < 0.03 + REACH * (time - old.placed)
+            if sight.probability < (STRUCK if struck else SURE):
                 continue
             new = self._start(time, sight)
             self.hypotheses.append(new)
@@ -235,31 +211,27 @@ class BallTracker:
         velocity = spread @ slope.T @ (weights[:, 0] * np.concatenate([d.velocity for d in sight.detections]))
         covariance[:3, :3], covariance[3:6, 3:6] = sight.covariance, spread + 0.3**2 * np.eye(3)
         covariance[6:, 6:] = 100.0**2 * np.eye(3)
-        ball = Kalman(np.concatenate([sight.point, velocity, np.zeros(3)]), covariance, self.physics)
+        ball = Kalman(np.concatenate([sight.point, velocity, np.zeros(3)]), covariance, PHYSICS)
         return Hypothesis(ball, time, time, time, time, score=weigh(sight))
 
     def _choose(self, time: float) -> None:
         """Drops what is seen no more, and reports the likeliest."""
-        options = self.options
         self.hypotheses = [
-            h
-            for h in self.hypotheses
-            if time - h.placed <= (options.forget if h is self.reported else options.drop) + 1e-9
+            h for h in self.hypotheses if time - h.placed <= (FORGET if h is self.reported else DROP) + 1e-9
         ]
         if self.reported not in self.hypotheses:
             self.reported = None
         others = [h for h in self.hypotheses if h is not self.reported and h.placed == time and self._is_ball(h)]
         best, old = max(others, key=lambda h: h.score, default=None), self.reported
-        lost = old is None or time - old.placed > options.drop
-        if best is not None and (lost or old is None or best.score > old.score + options.margin):
+        lost = old is None or time - old.placed > DROP
+        if best is not None and (lost or old is None or best.score > old.score + MARGIN):
             self.reported, self.number = best, self.number + 1
         order = sorted(self.hypotheses, key=lambda h: (h is not self.reported, -h.hits, h.begun))
-        self.hypotheses = order[: options.most]
+        self.hypotheses = order[:MOST]
 
     def _is_ball(self, h: Hypothesis) -> bool:
-        options = self.options
-        enough = options.hits if h.speed > options.fast else options.slow_hits
-        return h.speed > options.slowest and h.hits >= enough and h.score > options.score
+        enough = HITS if h.speed > FAST else SLOW_HITS
+        return h.speed > SLOWEST and h.hits >= enough and h.score > SCORE
 
 
 def find_along(camera: Camera, seen: Detection, other: Camera) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""A place in space from what two cameras see, with its covariance and how well they agree."""
+"""What cameras see of a ball, and the place in space that several agree on, with its covariance and misfit."""
 
 from __future__ import annotations
 
@@ -8,9 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot_io.vision.camera import Camera
-from robot_io.vision.detection import Detection
 
 ROUNDS = 2  # of Gauss-Newton from the point nearest to the rays
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A ball in a picture.
+
+    centre              (2,) [px] of its streak at mid-exposure
+    covariance          (2, 2) [px^2] of the centre
+    velocity            (2,) [px/s]
+    velocity_deviation  [px/s] of each component
+    probability         that it is a ball
+    """
+
+    centre: np.ndarray
+    covariance: np.ndarray
+    velocity: np.ndarray
+    velocity_deviation: float
+    probability: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ LINE = 0.02  # [m] width of the white line (ITTF law 2.1.5)
 POINTS = 48  # of each side
 SIDES = ("left", "right", "near", "far")
 BESIDE_NET = 0.12  # [m] of the long sides that the net hides or shades
+BESIDE_MIDDLE = 0.02  # [m] of the short ones, where the middle line ends
 STEP = 0.25  # [px] of a profile
 WIDEST = 6.0  # [px] on either side that a step is judged by
 CONTRAST = 8.0  # grey levels of the least step
@@ -68,16 +69,13 @@ def find_edges(picture: np.ndarray, camera: Camera, reach: float) -> Edges:
 
 def _side(side: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) on a line's inner edge, and the direction (3,) to the table's middle."""
-    x, y = TABLE_WIDTH / 2 - LINE, TABLE_LENGTH / 2 - LINE
-    if side < 2:
-        sign = (-1.0, 1.0)[side]
-        along = np.linspace(-y + 0.03, y - 0.03, POINTS)
-        along = along[np.abs(along) > BESIDE_NET]
-        return np.stack([np.full_like(along, sign * x), along, 0 * along], -1), np.array([-sign, 0.0, 0.0])
-    sign = (-1.0, 1.0)[side - 2]
-    along = np.linspace(-x + 0.03, x - 0.03, POINTS)
-    along = along[np.abs(along) > 0.02]  # the middle line
-    return np.stack([along, np.full_like(along, sign * y), 0 * along], -1), np.array([0.0, -sign, 0.0])
+    across, sign = side // 2, (-1.0, 1.0)[side % 2]
+    half = np.array([TABLE_WIDTH, TABLE_LENGTH]) / 2 - LINE
+    along = np.linspace(-half[1 - across] + 0.03, half[1 - across] - 0.03, POINTS)
+    along = along[np.abs(along) > (BESIDE_NET, BESIDE_MIDDLE)[across]]
+    points, inward = np.zeros((len(along), 3)), np.zeros(3)
+    points[:, 1 - across], points[:, across], inward[across] = along, sign * half[across], -sign
+    return points, inward
 
 
 def _find_side(picture: np.ndarray, camera: Camera, side: int, reach: float) -> tuple[np.ndarray, ...]:

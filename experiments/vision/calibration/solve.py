@@ -53,6 +53,16 @@ def fit_edges(picture: np.ndarray, guess: Camera, lens: bool = True) -> tuple[Ca
     Raises:
         ValueError: fewer than three sides are found, or they do not fit a table.
     """
+
+    def change(camera: Camera, x: np.ndarray) -> Camera:
+        return adjust(camera, np.pad(x * UNIT[: len(x)], (0, len(UNIT) - len(x))))
+
+    def residuals(x: np.ndarray, camera: Camera, edges: Edges) -> np.ndarray:
+        moved = change(camera, x)
+        away = np.nan_to_num(edges.residuals(moved), nan=1e3) / EDGE
+        lens_change = [np.log(moved.matrix[0, 0] / guess.matrix[0, 0]), moved.distortion[0] - guess.distortion[0]]
+        return np.concatenate([away, lens_change / PRIOR[6:]])
+
     camera = guess
     for reach in REACHES:
         edges = find_edges(picture, camera, reach)
@@ -64,21 +74,9 @@ def fit_edges(picture: np.ndarray, guess: Camera, lens: bool = True) -> tuple[Ca
                 "correct its position and rotation in the rig's YAML until they are right to a few centimetres and "
                 "degrees, and clear the table"
             )
-        free = slice(8) if lens and reach < 80.0 else slice(6)
-
-        def residuals(x: np.ndarray, edges: Edges = edges, free: slice = free, camera: Camera = camera) -> np.ndarray:
-            change = np.zeros(8)
-            change[free] = x * UNIT[free]
-            moved = adjust(camera, change)
-            away = np.nan_to_num(edges.residuals(moved), nan=1e3) / EDGE
-            lens_change = [np.log(moved.matrix[0, 0] / guess.matrix[0, 0]), moved.distortion[0] - guess.distortion[0]]
-            return np.concatenate([away, lens_change / PRIOR[6:]])
-
-        count = 8 if lens and reach < 80.0 else 6
-        solved = least_squares(residuals, np.zeros(count), loss="soft_l1", f_scale=3.0)
-        change = np.zeros(8)
-        change[free] = solved.x * UNIT[free]
-        camera = adjust(camera, change)
+        start = np.zeros(8 if lens and reach < REACHES[0] else 6)
+        solved = least_squares(residuals, start, loss="soft_l1", f_scale=3.0, args=(camera, edges))
+        camera = change(camera, solved.x)
     rms = float(np.sqrt(np.mean(edges.residuals(camera) ** 2)))
     if rms > LARGEST_RESIDUAL:
         raise ValueError(
@@ -146,61 +144,50 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
             f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; "
             "record more balls"
         )
-    problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
+    problem = _Problem(rig, edges, flights, bumped)
     x, jacobian = problem.solve()
     if flights:
-        rms = problem.misfits(x)
+        rms = np.sqrt(np.nanmean(problem.away(x) ** 2, axis=(0, 2, 3)))  # [px] of each flight
         keep = rms <= max(1.0, 3.0 * float(np.median(rms)))  # the net, a hand, or another ball
         if not keep.all() and keep.sum() >= FEWEST_FLIGHTS:
             flights = [flight for flight, kept in zip(flights, keep, strict=True) if kept]
-            problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
+            problem = _Problem(rig, edges, flights, bumped)
             x, jacobian = problem.solve()
     # The normal matrix holds the priors, which are residuals too.
     deviation = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))) * problem.scale
     cameras, delays, drag, _ = problem.parts(x)
-    deviations, undetermined = {}, []
-    for k, value in enumerate(problem.free):
-        deviations[problem.names[value]] = float(deviation[k])
-        if deviation[k] > DETERMINED * problem.prior[value]:
-            undetermined.append(problem.names[value])
+    own = {problem.names[i]: (float(v), problem.prior[i]) for i, v in zip(problem.free, deviation, strict=False)}
+    undetermined = tuple(name for name, (value, prior) in own.items() if value > DETERMINED * prior)
     residuals = []
-    away_all = problem.away(x)
-    for i, camera in enumerate(cameras):
-        away = [edges[i].residuals(camera)]
-        if flights:
-            away.append(away_all[i].ravel())
-        each = np.concatenate(away)
-        residuals.append(float(np.sqrt(np.nanmean(np.minimum(each**2, 9.0)))))
+    for camera, seen, flown in zip(cameras, edges, problem.away(x), strict=True):
+        away = np.concatenate([seen.residuals(camera), flown.ravel()])
+        residuals.append(float(np.sqrt(np.nanmean(np.minimum(away**2, 9.0)))))
     if max(residuals) > LARGEST_RESIDUAL:
         raise ValueError(
             f"expected residuals within {LARGEST_RESIDUAL} px, got {max(residuals):.2f}; nothing was changed"
         )
     fitted = replace(rig, cameras=tuple(cameras), delays=tuple(delays), residuals=tuple(residuals))
-    return Calibrated(fitted, deviations, tuple(undetermined), len(flights), drag)
+    deviations = {name: value for name, (value, _) in own.items()}
+    return Calibrated(fitted, deviations, undetermined, len(flights), drag)
 
 
 class _Problem:
     """Parameters, their priors, and residuals: of lines, of flights, and of the priors."""
 
-    def __init__(
-        self, rig: CameraRig, edges: tuple[Edges, ...], flights: tuple[Flight, ...], bumped: str | None
-    ) -> None:
-        self._rig, self._edges, self._flights = rig, edges, flights
+    def __init__(self, rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], bumped: str | None) -> None:
+        self._rig, self._edges, self._flights = rig, edges, tuple(flights)
         count = len(rig.cameras)
         kinds = ("turn x", "turn y", "turn z", "centre x", "centre y", "centre z", "focal", "k1")
         self.names = [f"{camera.name}: {kind}" for camera in rig.cameras for kind in kinds]
         self.names += [f"{camera.name}: delay" for camera in rig.cameras[1:]] + ["drag"]
         self.prior = np.concatenate([np.tile(PRIOR, count), np.full(count - 1, SKEW), [DRAG]])
-        unit = np.concatenate([np.tile(UNIT, count), np.full(count - 1, 1e-3), [DRAG]])
+        self._unit = np.concatenate([np.tile(UNIT, count), np.full(count - 1, 1e-3), [DRAG]])
         free = [i for i in range(8 * count) if bumped is None or (rig.cameras[i // 8].name == bumped and i % 8 < 6)]
         if flights and bumped is None:
             free += range(8 * count, 9 * count)
         self.free = np.array(free)
-        self._unit = unit
         self._first = self._first_states()
-        self.scale = np.concatenate([unit[self.free], np.tile(STATE, len(flights))])
-        self.start = np.zeros(len(self.scale))
-        self._longest = max((len(f.times) for f in flights), default=0)
+        self.scale = np.concatenate([self._unit[self.free], np.tile(STATE, len(flights))])
 
     def parts(self, x: np.ndarray) -> tuple[list[Camera], list[float], float, np.ndarray]:
         """Cameras, delays, drag and states (9, flights)."""
@@ -208,17 +195,15 @@ class _Problem:
         change = np.zeros(len(self._unit))
         change[self.free] = x[: len(self.free)] * self._unit[self.free]
         cameras = [adjust(c, change[8 * i : 8 * i + 8]) for i, c in enumerate(self._rig.cameras)]
-        delays = [
-            self._rig.delays[0],
-            *(d + c for d, c in zip(self._rig.delays[1:], change[8 * count : -1], strict=True)),
-        ]
+        delays = [d + c for d, c in zip(self._rig.delays, (0.0, *change[8 * count : -1]), strict=True)]
         states = self._first + (x[len(self.free) :].reshape(-1, 9) * STATE).T
         return cameras, delays, PHYSICS.drag + float(change[-1]), states
 
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
         """Solution and Jacobian, heavy tails taken lightly."""
+        start = np.zeros(len(self.scale))
         found = least_squares(
-            self.residuals, self.start, self.jacobian, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=40
+            self.residuals, start, self.jacobian, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=40
         )
         return found.x, self.jacobian(found.x)
 
@@ -235,35 +220,27 @@ class _Problem:
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """By differences; the flights' states, each of which moves only its own flight, all at once."""
         base, small, own, count = self.residuals(x), 1e-5, len(self.free), len(self._flights)
+        shared = sum(len(e.points) for e in self._edges) + own  # residuals that belong to no flight
         out = np.zeros((len(base), len(x)))
         for i in range(own):
             moved = x.copy()
             moved[i] += small
             out[:, i] = (self.residuals(moved) - base) / small
-        rows = (len(base) - self._shared) // max(count, 1)
+        rows = (len(base) - shared) // max(count, 1)
         for j in range(9 if count else 0):
             moved = x.copy()
             moved[own + j :: 9] += small
             change = (self.residuals(moved) - base) / small
             for k in range(count):
-                part = slice(self._shared + k * rows, self._shared + (k + 1) * rows)
+                part = slice(shared + k * rows, shared + (k + 1) * rows)
                 out[part, own + 9 * k + j] = change[part]
         return out
-
-    @property
-    def _shared(self) -> int:
-        """Residuals that belong to no flight."""
-        return sum(len(e.points) for e in self._edges) + len(self.free)
-
-    def misfits(self, x: np.ndarray) -> np.ndarray:
-        """Root mean square [px] of each flight (flights,)."""
-        return np.sqrt(np.nanmean(self.away(x) ** 2, axis=(0, 2, 3)))
 
     def away(self, x: np.ndarray) -> np.ndarray:
         """Flights' projections less what each camera saw (cameras, flights, n, 2) [px]; NaN where it saw nothing."""
         cameras, delays, drag, states = self.parts(x)
         physics, count = replace(PHYSICS, drag=drag), len(self._flights)
-        out = np.full((len(cameras), count, self._longest, 2), np.nan)
+        out = np.full((len(cameras), count, max((len(f.times) for f in self._flights), default=0), 2), np.nan)
         if not count:
             return out
         # A camera whose delay is larger took its frames later than the flights' times say, by as much.

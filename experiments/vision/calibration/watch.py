@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,23 +11,19 @@ import numpy as np
 from ballmodel.constants import BALL_RADIUS
 from experiments.vision.calibration.edges import still_picture
 from experiments.vision.calibration.solve import Flight
-from robot_io.vision.detection import BallDetector, Detection
+from robot_io.vision.detector import Detector
 from robot_io.vision.recording import FrameReader
 from robot_io.vision.rig import CameraRig
-from robot_io.vision.tracker import BallTracker, TrackerOptions
+from robot_io.vision.tracker import BallTracker
+from robot_io.vision.triangulation import Detection
 
 STILLS = 15  # frames whose median stands still
 SHORTEST, LONGEST = 12, 40  # frames of a flight
 NEAR_TABLE = BALL_RADIUS + 0.03  # [m] of height at which a bounce may be
-LOOSE = TrackerOptions(floor=1.5)  # of cameras that are a few pixels off
+LOOSE = 1.5  # [px] by which cameras may be off
 
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """Detections of all cameras in frames of one time [s], of the first camera's clock."""
-
-    time: float
-    detections: tuple[tuple[Detection, ...], ...]
+Moment = tuple[float, list[list[Detection]]]  # [s] of the first camera's clock; what each camera saw then
+Row = tuple[float, np.ndarray, list[np.ndarray]]  # time [s], place [m], and pixel in each camera
 
 
 def read_stills(path: Path, rig: CameraRig) -> list[np.ndarray]:
@@ -70,25 +65,24 @@ def pair_frames(path: Path, rig: CameraRig) -> Iterator[tuple[float, list[np.nda
             waiting = {}
 
 
-def detect_all(frames: Iterable[tuple[float, list[np.ndarray]]], detectors: Sequence[BallDetector]) -> Iterator[Moment]:
+def detect_all(frames: Iterable[tuple[float, list[np.ndarray]]], detectors: Sequence[Detector]) -> Iterator[Moment]:
     """What each detector finds in its camera's frames."""
     for time, pictures in frames:
-        found = (tuple(detector.detect(frame)) for detector, frame in zip(detectors, pictures, strict=True))
-        yield Moment(time, tuple(found))
+        yield time, [detector.detect(frame) for detector, frame in zip(detectors, pictures, strict=True)]
 
 
 def find_flights(moments: Iterable[Moment], rig: CameraRig) -> list[Flight]:
     """Free flights between bounces that the first two cameras saw, by a tracker of roughly known cameras."""
-    tracker = BallTracker(rig.cameras, replace(LOOSE))
-    runs: dict[int, list[tuple[float, np.ndarray, list[np.ndarray]]]] = {}
-    for moment in moments:
-        ball = tracker.update(moment.time, moment.detections)
-        if ball is None or tracker.reported is None or tracker.reported.placed != moment.time:
+    tracker = BallTracker(rig.cameras, LOOSE)
+    runs: dict[int, list[Row]] = {}
+    for time, detections in moments:
+        ball = tracker.update(time, detections)
+        if ball is None or tracker.reported is None or tracker.reported.placed != time:
             continue
         sight = min(tracker.sights, key=lambda s: float(np.linalg.norm(s.point - ball.position)))
         pixels = [d.centre for d in sight.detections]
         pixels += [np.full(2, np.nan)] * (len(rig.cameras) - 2)
-        runs.setdefault(ball.number, []).append((moment.time, sight.point, pixels))
+        runs.setdefault(ball.number, []).append((time, sight.point, pixels))
     flights = []
     for run in runs.values():
         for part in _cut(run, 3.5 / rig.rate):
@@ -97,11 +91,9 @@ def find_flights(moments: Iterable[Moment], rig: CameraRig) -> list[Flight]:
     return flights
 
 
-def _cut(
-    run: list[tuple[float, np.ndarray, list[np.ndarray]]], gap: float
-) -> Iterator[list[tuple[float, np.ndarray, list[np.ndarray]]]]:
+def _cut(run: list[Row], gap: float) -> Iterator[list[Row]]:
     """Pieces without bounces and gaps, of some length, their ends cut off."""
-    pieces: list[list[tuple[float, np.ndarray, list[np.ndarray]]]] = [[run[0]]]
+    pieces: list[list[Row]] = [[run[0]]]
     for last, row in pairwise(run):
         if row[0] - last[0] > gap or row[1][2] < NEAR_TABLE:
             pieces.append([])

@@ -21,7 +21,6 @@ from experiments.errors import ConfigError
 from experiments.finetuning.robot import LockStepRobot
 from experiments.options import RIG, RobotOptions
 from experiments.view import measured
-from experiments.view.viewer import robot_of
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import log
@@ -94,7 +93,7 @@ def test_the_viewers_layout_and_frames_are_the_robots(played):
     labels = [line["label"] for line in layout["configById"]["Plot!commands"]["paths"]]
     assert labels == [f"{name} sent" for name in robot.contract.joints]
     replays = measured.load_session(path, SimModel())
-    assert robot_of(replays) == robot and replays.count == BALLS
+    assert replays.robot == robot and replays.count == BALLS
     (replay,) = replays.replays(0)
     assert replay.qpos.shape[1] == robot.contract.n_joints and np.isfinite(replay.qpos).all()
 

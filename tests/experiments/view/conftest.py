@@ -1,7 +1,5 @@
 """One compiled recorder for all tests of the viewer."""
 
-from __future__ import annotations
-
 import pytest
 
 from ballmodel import registry

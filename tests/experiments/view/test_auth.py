@@ -1,7 +1,5 @@
 """Admission to the page over real sockets: the token, pages that are refused, and what the command refuses."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import socket
@@ -21,19 +19,17 @@ COOKIE = {"Cookie": f"{auth.COOKIE}={TOKEN}"}
 
 
 @pytest.fixture(scope="module")
-def local():
-    """The port of a page for this machine."""
-    server = auth.Server("127.0.0.1", 0)
-    yield server.get_port()
-    server.stop()
+def ports():
+    """Ports of a page for this machine and of one that needs a token."""
+    servers = [auth.Server("127.0.0.1", 0), auth.Server("127.0.0.1", 0, TOKEN)]
+    yield [server.get_port() for server in servers]
+    for server in servers:
+        server.stop()
 
 
-@pytest.fixture(scope="module")
-def shared():
-    """The port of a page that needs a token."""
-    server = auth.Server("127.0.0.1", 0, TOKEN)
-    yield server.get_port()
-    server.stop()
+@pytest.fixture
+def shared(ports):
+    return ports[1]
 
 
 def get(port, path="/", **headers) -> tuple[int, bytes, dict]:
@@ -88,31 +84,27 @@ def test_silent_and_endless_requests_do_not_disturb_others(shared):
         assert get(shared, "/", **COOKIE)[0] == 200
 
 
-def test_behind_the_token_pages_of_the_address_that_was_asked_for_are_answered(shared):
-    assert answers(shared, f"http://127.0.0.1:{shared}", **COOKIE)
-    assert answers(shared, None, **COOKIE)
-    for origin in ("http://example.org", f"http://127.0.0.1:{shared + 1}", f"http://localhost:{shared}"):
-        assert not answers(shared, origin, **COOKIE)
+# Which of the two answer a page of this origin; behind the token only pages of the address that was asked for.
+ORIGINS = {
+    None: (True, True),  # a program
+    "http://127.0.0.1:{port}": (True, True),
+    "http://localhost:{port}": (True, False),
+    "http://[::1]:{port}": (True, False),
+    "http://example.org": (False, False),
+    "http://example.org:{port}": (False, False),  # a name that its owner points to this machine
+    "http://localhost.example.org:{port}": (False, False),
+    "http://127.0.0.1:1": (False, False),  # another program of this machine
+    "http://localhost": (False, False),
+    "http://[::1:{port}": (False, False),
+    "http://localhost:{port}x": (False, False),
+    "null": (False, False),  # a file, or a frame without rights
+}
 
 
-def test_this_machine_answers_its_own_pages_and_programs_without_a_page(local):
-    for name in ("127.0.0.1", "localhost", "[::1]"):
-        assert answers(local, f"http://{name}:{local}")
-    assert answers(local, None)
-
-
-def test_this_machine_refuses_pages_of_others(local):
-    for origin in (
-        "http://example.org",
-        f"http://example.org:{local}",  # a name that its owner points to this machine: Host would be the same
-        f"http://localhost.example.org:{local}",
-        f"http://127.0.0.1:{local + 1}",  # another program of this machine
-        "http://localhost",
-        f"http://[::1:{local}",
-        f"http://localhost:{local}x",
-        "null",  # a file, or a frame without rights
-    ):
-        assert not answers(local, origin), origin
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_pages_of_this_machine_or_of_the_address_that_was_asked_for_are_answered_and_no_others(ports, origin):
+    for port, headers, expected in zip(ports, ({}, COOKIE), ORIGINS[origin], strict=True):
+        assert answers(port, origin and origin.format(port=port), **headers) == expected
 
 
 def test_a_forwarded_port_is_a_page_of_this_machine_too():

@@ -1,7 +1,5 @@
 """The viewer without a browser: what its controls do to the play, and what the scene then shows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Replays of a session at the robot, and of a diagnosis whose nominal model is known to be wrong."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Replays of simulated balls against the rollouts of the Python face."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Paths between control ticks, against flights that are known in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from experiments.view.replay import RATE, next_landing, upsample

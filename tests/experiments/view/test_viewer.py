@@ -3,8 +3,6 @@
 Drawn by a processor where there is no graphics card, a frame takes a while: everything is waited for.
 """
 
-from __future__ import annotations
-
 import io
 import shutil
 import subprocess

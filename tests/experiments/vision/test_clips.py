@@ -1,7 +1,5 @@
 """Labels of several programs, and frames of video files and recordings."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import pytest

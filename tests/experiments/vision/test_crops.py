@@ -1,7 +1,5 @@
 """Crops: what the labels say is where the picture has it, mirrored ones too."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

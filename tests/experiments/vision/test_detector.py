@@ -1,7 +1,5 @@
 """The shipped detector on pictures that another program drew, and its golden crops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,18 +1,17 @@
-"""What evaluation counts, on clips of drawn discs; the commands from a recording to its figures; the whole training."""
-
-from __future__ import annotations
+"""What evaluation counts, on clips of drawn discs; commands from a recording to its figures; training, calibration."""
 
 import json
 from contextlib import nullcontext
 
+import jax
 import numpy as np
 import pytest
 
 from experiments import cli
-from experiments.vision import clips, evaluation, export, pipeline
+from experiments.vision import clips, evaluation, export, network, pipeline
 from experiments.vision.pipeline import SHIPPED
 from robot_io.vision import rig
-from robot_io.vision.detector import Detector
+from robot_io.vision.detector import Detector, read_cells
 from robot_io.vision.recording import FrameWriter
 from tests.support.discs import draw_discs
 
@@ -33,8 +32,22 @@ def test_a_clip_s_balls_misses_and_false_sights_are_counted(tmp_path):
     for guided in (False, True):
         sights = evaluation.evaluate_clip(SHIPPED, clip, labels, guided)
         assert (sights.frames, sights.balls, sights.found) == (7, 6, 5)  # from the third frame on, without one
-        assert sights.false >= 2 and sights.error.max() < 1.0
+        assert sights.false >= 2 and max(sights.error) < 1.0
         assert any(line == "found 0.8333" for line in sights.lines())
+
+
+def test_calibration_scales_every_covariance_alike():
+    params = jax.tree.map(np.asarray, network.start(jax.random.key(0)))
+    crops = np.random.default_rng(0).integers(0, 255, (2, 4, 64, 64, 3), np.uint8)
+    scaled = pipeline.calibrate(params, np.full(10, 6.0))
+    before, after = (
+        read_cells(*(np.asarray(said).transpose(0, 3, 1, 2) for said in network.apply(p, *crops)))
+        for p in (params, scaled)
+    )
+    # Errors three times too large for the covariance: it grows threefold.
+    np.testing.assert_allclose(after.covariance, 3 * before.covariance, rtol=1e-3)
+    np.testing.assert_allclose(after.centre, before.centre, atol=1e-4)
+    assert after.probability == pytest.approx(before.probability, abs=1e-5)
 
 
 @pytest.mark.slow

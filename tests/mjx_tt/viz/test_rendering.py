@@ -1,7 +1,5 @@
 """Pictures and videos: real files, read back, with the things in them where the scene has them."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The detector's arithmetic against closed forms, and its manners; what it finds is tested with its weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

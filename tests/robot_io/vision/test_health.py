@@ -1,13 +1,15 @@
 """Faults of cameras, made on purpose, are named within a second, and nothing is named without one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.vision import render
 from robot_io.vision import rig
-from robot_io.vision.detection import Detection
 from robot_io.vision.health import Health
+from robot_io.vision.triangulation import Detection
 
 RIG = rig.standard()
 PERIOD = 1.0 / RIG.rate
@@ -27,7 +29,7 @@ def pictures() -> dict[str, list[list[np.ndarray]]]:
             rng = np.random.default_rng(4)
             scene, person = render.make_scene(stands, rng), render.Actors(rng)
             if kind == "dark":
-                scene.relight(scene.gain, 0.7 * scene.brightness)
+                scene = replace(scene, brightness=0.7 * scene.brightness)
             shapes = [person.person(0.05 * k, None) for k in range(4)]
             out[kind].append([render.render(scene, render.no_ball, 0.0, rng, s).frame for s in shapes])
     return out

@@ -1,7 +1,5 @@
 """Raw frames come back bit by bit, with their stamps; what is no recording is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import zstandard

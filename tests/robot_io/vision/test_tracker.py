@@ -11,9 +11,8 @@ from ballmodel import flight
 from ballmodel.kalman import Physics, move
 from ballmodel.state import BallState
 from robot_io.vision import rig
-from robot_io.vision.detection import Detection
 from robot_io.vision.tracker import BallTracker
-from robot_io.vision.triangulation import predict_deviation, triangulate
+from robot_io.vision.triangulation import Detection, predict_deviation, triangulate
 
 CAMERAS = rig.standard().cameras
 PERIOD = 0.008
@@ -37,6 +36,11 @@ def detect(camera, place, velocity, rng, sigma=0.2, probability=0.99) -> Detecti
     return Detection(camera.project(place) + rng.normal(0, sigma, 2), sigma**2 * np.eye(2), speed, 100.0, probability)
 
 
+def see(place, velocity, rng, **how) -> list[list[Detection]]:
+    """What both cameras see of one ball."""
+    return [[detect(camera, place, velocity, rng, **how)] for camera in CAMERAS]
+
+
 def clutter(camera, rng) -> Detection:
     return Detection(rng.uniform(0, camera.size), 0.05 * np.eye(2), rng.normal(0, 300, 2), 200.0, 0.9)
 
@@ -44,8 +48,7 @@ def clutter(camera, rng) -> Detection:
 def test_places_are_off_by_what_their_covariance_says():
     rng, squared = np.random.default_rng(0), []
     for place in rng.uniform([-0.7, -1.3, 0.0], [0.7, 1.3, 0.5], (150, 3)):
-        seen = [detect(camera, place, np.zeros(3), rng) for camera in CAMERAS]
-        sight = triangulate(CAMERAS, seen, floor=0.0)
+        sight = triangulate(CAMERAS, [row[0] for row in see(place, np.zeros(3), rng)], floor=0.0)
         away = sight.point - place
         squared.append((away @ np.linalg.solve(sight.covariance, away), sight.deviation))
     inside, miss = np.mean(squared, axis=0)
@@ -59,8 +62,8 @@ def test_placement_is_judged_by_predicted_deviations():
 
 
 @pytest.fixture(scope="module")
-def tracked() -> list[tuple]:
-    """Of each frame: place error [m], velocity error [m/s], number; a camera is blind for a while."""
+def tracked() -> np.ndarray:
+    """Of each frame with a ball: time [ms], place error [m], velocity error [m/s], number; one camera goes blind."""
     places, velocities = fly()
     rng, tracker, rows = np.random.default_rng(1), BallTracker(CAMERAS), []
     for k in range(0, len(places), 8):
@@ -70,28 +73,19 @@ def tracked() -> list[tuple]:
             if camera.sees(places[k]) and rng.random() < 0.97 and not blind:
                 seen[i].append(detect(camera, places[k], velocities[k], rng))
         ball = tracker.update(1.0 + k * 1e-3, seen)
-        rows.append(
-            (k, None, None, 0)
-            if ball is None
-            else (
-                k,
-                np.linalg.norm(ball.position - places[k]),
-                np.linalg.norm(ball.velocity - velocities[k]),
-                ball.number,
-            )
-        )
-    return rows
+        if ball is not None:
+            errors = (ball.position - places[k], ball.velocity - velocities[k])
+            rows.append((k, *np.linalg.norm(errors, axis=1), ball.number))
+    return np.array(rows)
 
 
 def test_a_ball_is_found_at_once_and_followed_through_its_bounce(tracked):
     places, velocities = fly()
     assert velocities[-1, 2] > velocities[100, 2] and places[:, 2].min() < 0.025  # it bounced
-    first = next(row[0] for row in tracked if row[1] is not None)
-    later = [row for row in tracked if row[0] >= first]
-    assert first <= 32 and all(row[1] is not None for row in later)
-    assert {row[3] for row in later} == {1}
-    assert np.percentile([row[1] for row in later], 90) < 0.002
-    assert np.percentile([row[2] for row in later if row[0] > first + 30], 75) < 0.1
+    times, place, velocity, number = tracked.T
+    assert times[0] <= 32 and (np.diff(times) == 8).all() and times[-1] == 592 and (number == 1).all()
+    assert np.percentile(place, 90) < 0.002
+    assert np.percentile(velocity[times > times[0] + 30], 75) < 0.1
 
 
 def test_a_stroke_is_another_ball_from_its_first_place_on():
@@ -103,12 +97,11 @@ def test_a_stroke_is_another_ball_from_its_first_place_on():
         if k > 160:
             state = move(struck, (k - 160) * 1e-3, Physics(drag=0.141))[:, 0]
             place, velocity = state[:3], state[3:6]
-        ball = tracker.update(k * 1e-3, [[detect(c, place, velocity, rng)] for c in CAMERAS])
+        ball = tracker.update(k * 1e-3, see(place, velocity, rng))
         if ball is not None:
             numbers.append((k, ball.number, np.linalg.norm(ball.position - place)))
-    before, after = ([row for row in numbers if (row[0] > 160) == late] for late in (False, True))
-    assert {row[1] for row in before} == {1} and {row[1] for row in after} == {2}
-    assert max(row[2] for row in after) < 0.005
+    time, number, error = np.array(numbers).T
+    assert (number == np.where(time > 160, 2, 1)).all() and error[time > 160].max() < 0.005
 
 
 def test_clutter_alone_and_hands_are_no_balls():
@@ -125,7 +118,7 @@ def test_guesses_lie_where_the_ball_will_be():
     places, velocities = fly()
     rng, tracker = np.random.default_rng(4), BallTracker(CAMERAS)
     for k in range(0, 80, 8):
-        tracker.update(k * 1e-3, [[detect(c, places[k], velocities[k], rng)] for c in CAMERAS])
+        tracker.update(k * 1e-3, see(places[k], velocities[k], rng))
     for camera, guesses in zip(CAMERAS, tracker.guesses(0.080), strict=True):
         assert guesses[0] == pytest.approx(camera.project(places[80]), abs=2.0)
 
@@ -137,8 +130,8 @@ def test_what_one_camera_sees_alone_is_sought_along_its_ray_by_the_other(blind):
     places = [place for place in places if all(camera.sees(place, 5.0) for camera in CAMERAS)]
     assert len(places) > 60
     for place in places:
-        seen = [[detect(c, place, np.zeros(3), rng)] for c in CAMERAS]
-        seen[blind], tracker = [], BallTracker(CAMERAS)
+        seen, tracker = see(place, np.zeros(3), rng), BallTracker(CAMERAS)
+        seen[blind] = []
         assert tracker.update(0.0, seen) is None
         guesses = tracker.guesses(PERIOD)
         assert not guesses[1 - blind]
@@ -151,7 +144,7 @@ def test_a_ball_that_is_unsure_everywhere_but_where_it_was_expected_is_believed(
     places, velocities = fly()
     rng, tracker, found = np.random.default_rng(6), BallTracker(CAMERAS), []
     for k in range(0, 80, 8):
-        seen = [[detect(c, places[k], velocities[k], rng, probability=0.9)] for c in CAMERAS]
+        seen = see(places[k], velocities[k], rng, probability=0.9)
         if k % 32 == 16:
             seen[0] = []  # hidden from one camera
         found.append(tracker.update(k * 1e-3, seen) is not None)
