@@ -34,8 +34,8 @@ import jax  # noqa: E402 - reads the environment
 from jaxtyping import install_import_hook  # noqa: E402
 
 import tests.support.type_checker  # noqa: E402, F401 - found by its name
-from tests.support.durations import pytest_itemcollected  # noqa: E402, F401 - for pytest
-from tests.support.machine_watch import pytest_collection_modifyitems, watched_machine  # noqa: E402, F401 - for pytest
+from tests.support.durations import mark_deferred  # noqa: E402
+from tests.support.machine_watch import rerun_after_pauses, watched_machine  # noqa: E402, F401 - for pytest
 
 # STRICT_ARRAYS=1: annotations of functions are checked, arrays by type and shape, in every call (of compiled functions:
 # when they are traced); numbers change their type and arrays their rank only where the code says so.
@@ -53,6 +53,11 @@ USERS_COLUMNS = evaluator.COLUMNS
 if STRICT:
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    mark_deferred(items)
+    rerun_after_pauses(items)
 
 
 def pytest_collection_finish() -> None:

@@ -1,8 +1,9 @@
 """How long tests take, and which of them a newcomer need not wait for.
 
 ``tests/durations.json`` holds the seconds of every test that took HALF a second or more, set-up included, when
-``make durations`` timed them last. Those above LONGEST are marked ``deferred``: they run with the slow ones. A test
-marked ``smoke`` is never deferred. A test without a record counts as quick.
+``make durations`` timed them last. Those above LONGEST are marked ``deferred``: they run with the slow ones, as does the
+rest of a file that is half of such tests. A test marked ``smoke`` is never deferred. A test without a record counts as
+quick.
 """
 
 from __future__ import annotations
@@ -25,11 +26,19 @@ def read_seconds() -> dict[str, float]:
     return json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Marks a test that took longer than LONGEST."""
-    marked = any(item.get_closest_marker(name) for name in ("slow", "smoke"))
-    if read_seconds().get(item.nodeid, 0.0) > LONGEST and not marked:
-        item.add_marker(pytest.mark.deferred)
+def mark_deferred(items: list[pytest.Item]) -> None:
+    """Marks the tests that took longer than LONGEST, and of a file where they are half of all the others as well.
+
+    The first test that needs a program pays for compiling it: the others of its file would only pay in its place.
+    """
+    able = [item for item in items if not any(item.get_closest_marker(name) for name in ("slow", "smoke"))]
+    long = [read_seconds().get(item.nodeid, 0.0) > LONGEST for item in able]
+    share: dict[Path, list[bool]] = {}
+    for item, is_long in zip(able, long, strict=True):
+        share.setdefault(item.path, []).append(is_long)
+    for item, is_long in zip(able, long, strict=True):
+        if is_long or 2 * sum(share[item.path]) >= len(share[item.path]):
+            item.add_marker(pytest.mark.deferred)
 
 
 def main(recorded: str) -> None:

@@ -80,7 +80,8 @@ def watched_machine(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def rerun_after_pauses(items: list[pytest.Item]) -> None:
+    """Lets a test in real time run again where the machine stood still in it."""
     for item in items:
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2, condition=_stood))
