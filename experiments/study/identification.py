@@ -84,9 +84,9 @@ def identify(
         parts.append(delays.draw_unseen(ranges, arm, unseen, of_balls.DRAWS))
     # In the table frame it is the camera that is off, not the table's height: no ball before a hit can tell them apart.
     of_flight = balls_fit.samples(lift)
-    parts.insert(0, replace(of_flight, paths=tuple(SEEN_HIGH if p == HEIGHT else p for p in of_flight.paths)))
-    drawn = np.concatenate([one.values for one in parts], axis=1)  # row by row side by side
-    drawn_paths = tuple(path for one in parts for path in one.paths)
+    every = [replace(of_flight, paths=tuple(SEEN_HIGH if p == HEIGHT else p for p in of_flight.paths)), *parts]
+    drawn = np.concatenate([one.values for one in every], axis=1)  # row by row side by side
+    drawn_paths = tuple(path for one in every for path in one.paths)
     samples = delays.shift_command(Samples(drawn_paths, drawn, np.ones(len(drawn))), axes)
     settled = {*samples.paths, *((delays.ARM,) if parts else ())}
     others: list[Randomised] = [one for one in before if one.path not in settled]

@@ -1,9 +1,9 @@
 """How long tests take, and which of them a newcomer need not wait for.
 
 ``tests/durations.json`` holds the seconds of every test that took HALF a second or more, set-up included, when
-``make durations`` timed them last. Those above LONGEST are marked ``deferred``: they run with the slow ones, as does the
-rest of a file that is half of such tests. A test marked ``smoke`` is never deferred. A test without a record counts as
-quick.
+``make durations`` timed them last. Those above LONGEST are marked ``deferred``: they run with the slow ones, as does
+the rest of a file that is half of such tests. A test marked ``smoke`` is never deferred. A test without a record counts
+as quick.
 """
 
 from __future__ import annotations
