@@ -58,7 +58,6 @@ class Left:
     """What a set of causes leaves to the discrepancy."""
 
     coefficients: Float[np.ndarray, " c"]  # of all columns, effects' sizes beside the discrepancy among them
-    beyond: Float[np.ndarray, " c"]  # of the discrepancy, less what the set could take of it
     evidence: float  # logarithm, of set and discrepancy together
     explained: float  # squared whitened error that set and discrepancy explain together
 
@@ -244,8 +243,7 @@ class LinearModel:
         out[other] = mean
         out[inside] = share[:, -1] - share[:, :-1] @ mean
         out[: self.effects] += self.middle
-        smooth = np.where(np.arange(len(right)) < k, 0.0, out)
-        return Left(out, self.beyond(chosen, smooth), logarithm - price, explained + float(inner_right @ mean))
+        return Left(out, logarithm - price, explained + float(inner_right @ mean))
 
     def beyond(self, chosen: Set, smooth: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
         """Coefficients of functions less what a set of causes could take of them: orthogonal to the set."""

@@ -146,7 +146,8 @@ def search(
         at = Situation(theta, start)
     if held:
         without = {j: sizes.beside(model, tuple(c for c in chosen if c != j)) for j in chosen}
-        picked = replace(picked, causes=tuple(sorted(chosen)), without=without)
+        path = [(*s, *held) for s in picked.path]
+        picked = replace(picked, causes=tuple(sorted(chosen)), path=path, without=without)
     level = sizes.of(left, unknowns)
     return Search(at, linear, own, prior, model, columns, picked, shift, spin_shift, level)
 
@@ -212,7 +213,7 @@ def _linear_model(
         more = marginal.growth(problem, flights, linear, at, physical)
     # What is wrong with all bounces would pass for bounces that scatter, and with all flights for spin: how spins and
     # kicks are distributed is asked of what effects and discrepancy together leave.
-    theta, everything = np.pad(at.theta, (0, len(columns) - k)), Left(np.zeros(0), np.zeros(0), 0.0, 0.0)
+    theta, everything = np.pad(at.theta, (0, len(columns) - k)), Left(np.zeros(0), 0.0, 0.0)
     for _ in range(PASSES):
         prior, scatter = marginal.distributions(products, theta, prior, own.scatter)
         own = replace(own, scatter=scatter)
