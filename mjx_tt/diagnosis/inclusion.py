@@ -93,7 +93,7 @@ class LinearModel:
         """The model of some of the pieces."""
         return replace(self, piece_gram=self.piece_gram[which], piece_right=self.piece_right[which])
 
-    def holding(self, held: Set) -> LinearModel:
+    def hold(self, held: Set) -> LinearModel:
         """The model with causes that every set holds."""
         return replace(
             self,
@@ -245,7 +245,7 @@ class LinearModel:
         out[: self.effects] += self.middle
         return Left(out, logarithm - price, explained + float(inner_right @ mean))
 
-    def beyond(self, chosen: Set, smooth: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
+    def orthogonalise(self, chosen: Set, smooth: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
         """Coefficients of functions less what a set of causes could take of them: orthogonal to the set."""
         inside = [*self.always, *(c for c in chosen if c not in self.always)]
         gram, out = self.total[0], smooth.copy()
@@ -253,7 +253,7 @@ class LinearModel:
         out[inside] -= np.linalg.solve(full, gram[inside] @ smooth)
         return out
 
-    def catalogued(
+    def find_catalogued(
         self, chosen: Set, left: Left, square: Float[np.ndarray, "c c"], whole: float, nothing: float
     ) -> Set:
         """Causes, two at most, that beside a set leave a fifth of its discrepancy where that is a fifth of the error.
@@ -265,15 +265,15 @@ class LinearModel:
         able = [c for c in self.candidates if c not in chosen]
 
         def size(causes: Set) -> float:
-            rest = self.beyond(causes, smooth)
+            rest = self.orthogonalise(causes, smooth)
             return float(rest @ square @ rest)
 
-        beyond = size(chosen)
-        for count in (1, 2) if beyond > max(LEAST_LEFT_SHARE * whole, nothing) else ():
+        before = size(chosen)
+        for count in (1, 2) if before > max(LEAST_LEFT_SHARE * whole, nothing) else ():
             sets = [(*chosen, *more) for more in combinations(able, count)]
             sets = [s for s, e in zip(sets, self.evidence(sets), strict=True) if np.isfinite(e)] if sets else []
             best = min(sets, key=size, default=chosen)
-            if size(best) < LEAST_LEFT_SHARE * beyond:
+            if size(best) < LEAST_LEFT_SHARE * before:
                 return best[len(chosen) :]
         return ()
 

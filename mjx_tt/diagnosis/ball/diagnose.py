@@ -16,7 +16,7 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.noise import Jitter
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
-from mjx_tt.diagnosis.ball.search import Search, Sessions, after_starts, mean_square, search, spins_pay
+from mjx_tt.diagnosis.ball.search import Search, Sessions, mean_square, remove_starts, search, spins_pay
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
 from mjx_tt.diagnosis.inclusion import LEAST_LEFT_SHARE, Set
 from mjx_tt.diagnosis.logs import before_racket
@@ -182,9 +182,9 @@ def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float
     def sizes(columns: np.ndarray) -> tuple[float, float]:
         smooth = np.where(np.isin(np.arange(len(found.columns)), columns), left.coefficients, 0.0)
         if found.prior is None:  # beside spins of their own, which take up much, functions count whole
-            smooth = found.model.beyond(found.chosen, smooth)
+            smooth = found.model.orthogonalise(found.chosen, smooth)
         shown = np.tensordot(smooth, found.columns, 1)[None]
-        square = (after_starts(shown, found.linear, g).reshape(g.n, 3, -1) ** 2).sum(axis=1)
+        square = (remove_starts(shown, found.linear, g).reshape(g.n, 3, -1) ** 2).sum(axis=1)
         return float(np.percentile(np.sqrt(square.max(axis=1)), 90)), float(np.sqrt(square.sum() / g.mask.sum()))
 
     families = [f for f in found.model.families if found.picked.left.coefficients[f.columns].any()]

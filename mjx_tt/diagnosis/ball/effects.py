@@ -41,6 +41,7 @@ class Effect(Description):
         None  # of a finite difference: a fraction of the scale, unless the effect starts with a threshold
     )
     low: float = -np.inf  # smallest change that makes sense
+    kinked: bool = False  # a ball that grips the table may slide a little further on
     at_paddle: bool = False  # only a hit shows it, with the joints' log beside the ball's
     needs_spin: bool = False  # shows only on balls that spin
     made_of: tuple[str, ...] = ()  # effects that it changes together: beside all of them it is no unknown of its own
@@ -272,6 +273,7 @@ EFFECTS: tuple[Effect, ...] = (
         scale=0.06,
         unit="1",
         reading="flat and fast balls, or a sled on the table",
+        kinked=True,
     ),
     Effect(
         name="table_grip",
@@ -281,6 +283,7 @@ EFFECTS: tuple[Effect, ...] = (
         scale=0.1,
         unit="1",
         reading="a marked ball without spin that lands steeply, filmed from the side",
+        kinked=True,
         low=0.0,
     ),
     Effect(

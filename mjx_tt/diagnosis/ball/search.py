@@ -117,7 +117,7 @@ def search(
             own = replace(noise.estimate(left, frame, g, unknowns), scatter=scatter)
         sizes = Sizes(problem, at, own, prior)
         level = sizes.of(left, unknowns)
-        beside = model.holding(held)
+        beside = model.hold(held)
         picked = choose(beside, partial(sizes.beside, beside), before, error, level, NO_ERROR, round_ < EARLY)
         chosen = (*picked.causes, *held)
         size, covariance, _ = model.solve(chosen)
@@ -130,11 +130,12 @@ def search(
         stays = np.max(moved, initial=0.0) < SETTLED or gain < LEAST_GAIN
         again = picked.causes in seen and picked.causes != before
         if round_ >= EARLY and ((picked.causes == before and stays) or again):
-            rows = after_starts(columns, linear, g)
+            if prior is not None:  # balls with spins of their own take up much: what is left is no other cause's
+                break
+            rows = remove_starts(columns, linear, g)
             square = np.einsum("nrc,nrd->cd", rows, rows, optimize=True) / g.mask.sum()
             whole = float(np.max(picked.errors)) - level
-            # Balls with spins of their own take up much: what is left beside them is no other cause's.
-            more = () if prior is not None else model.catalogued(chosen, picked.left, square, whole, NO_ERROR)
+            more = model.find_catalogued(chosen, picked.left, square, whole, NO_ERROR)
             if not more:
                 break
             held, seen = (*held, *more), set()
@@ -337,7 +338,7 @@ class Sizes:
         return mean_square(left[..., self.index], self.problem.grid, unknowns)
 
 
-def after_starts(columns: Float[np.ndarray, "c 3 T n"], linear: Linear, g: Grid) -> Float[np.ndarray, "n s c"]:
+def remove_starts(columns: Float[np.ndarray, "c 3 T n"], linear: Linear, g: Grid) -> Float[np.ndarray, "n s c"]:
     """Columns [m] of each ball's samples, less what its own start takes of them."""
 
     def rows(x: np.ndarray) -> np.ndarray:

@@ -20,7 +20,6 @@ from mjx_tt.sim.model import SimModel
 SPIN, KICK = slice(6, 9), slice(9, 12)
 MAGNUS = FLIGHT + "magnus_coefficient"
 START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3 + [1e-5] * 3)  # [m], [m/s], [rad/s], [m/s]
-KINKS = ("table_friction", "table_grip")  # a ball that grips the table may slide a little further on
 COARSE = 0.1  # of an effect's scale: a step over which few balls go from sliding to rolling at once
 REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (published: 0.3 to 1.5)
 
@@ -75,14 +74,14 @@ class BallProblem:
     def linearise(self, at: Situation, g: Grid | None = None, across: bool = False) -> Linear:
         """Residuals and derivatives at a situation.
 
-        across: those by KINKS over an ordinary size both ways, for a search that has to see what counts beyond a kink.
+        across: by effects with a kink over an ordinary size both ways, for a search that has to see beyond the kink.
         """
         g = self.grid if g is None else g
         k = len(self.effects)
         moves = np.array([e.step if e.step is not None else 1e-3 * e.scale for e in self.effects])
         # A step of its own is for an effect without a derivative at zero; elsewhere it would only blur.
         moves = np.where(at.theta != 0.0, np.minimum(moves, np.maximum(0.1 * np.abs(at.theta), 1e-6)), moves)
-        kinks = np.array([i for i, e in enumerate(self.effects) if across and e.name in KINKS], dtype=int)
+        kinks = np.array([i for i, e in enumerate(self.effects) if across and e.kinked], dtype=int)
         moves[kinks] = [self.effects[i].scale for i in kinks]
         # Variants: as it is; start moved (6); effects changed (k); with a ball that air can bend: as it is, spun (3);
         # and kicked at the bounce (3); effects with a kink, changed the other way.
