@@ -1,4 +1,4 @@
-"""Robots: ``mjx-tt run``, ``finetune``, ``robot`` (with ``new``, ``place`` and ``list``) and ``rig``."""
+"""Robots: ``mjx-tt run``, ``practise``, ``finetune``, ``robot`` (with ``new``, ``place`` and ``list``) and ``rig``."""
 
 from __future__ import annotations
 
@@ -97,6 +97,39 @@ def finetune(
         screen.print(f"sigma {chosen.sigma}, step {rate}: the policy was trained by first-order gradients")
     report = on_robot.finetune(policy, chosen, Run(folder), robot, screen, setup)
     return 0 if report is not None else 130  # where it was stopped
+
+
+@command(
+    "practise",
+    """\
+  mjx-tt practise quickstart --robot rig --rig worn.yaml --seconds 600
+  mjx-tt practise quickstart --robot robot.yaml
+
+Plays as `mjx-tt run` does. Beside the control loop a process of low priority scores every ball about the world that is
+believed. After a change it identifies the world anew, trains on from the policy in play, and hands the new policy over
+between two balls where it is better. See docs/concepts/practice.md.
+""",
+)
+def practise(
+    policy: options.PolicyFolder,
+    /,
+    *,
+    robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" for the emulated robot')],
+    balls: Annotated[int | None, count("end after N balls (default: when the operator quits)")] = None,
+    rallies: Annotated[int | None, count("end after N rallies that count")] = None,
+    seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
+    updates: Annotated[int, count("of each training")] = 300,
+    out: Annotated[Path, option("FOLDER", "folder of log, journal, worlds and trainings")] = Path("runs/practice"),
+    setup: options.RobotOptions = options.ROBOT,
+) -> int:
+    """Plays, notices what has changed, learns it and plays on."""
+    find_policy(policy)
+    setup.check(robot)
+    options.check_writable(out)
+    options.start_jax()
+    from experiments.practice import on_robot
+
+    return on_robot.practise(policy, robot, out, make_console(), setup, updates, balls, rallies, seconds)
 
 
 robots_app = group(

@@ -6,9 +6,10 @@ import math
 import signal
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console
 
@@ -42,8 +43,11 @@ def run(
     balls: int | None = None,
     rallies: int | None = None,
     seconds: float | None = None,
+    accompany: Callable[[ControlSession], Companion] | None = None,
 ) -> int:
     """Plays a policy; returns the exit status.
+
+    accompany: makes what is to go along with play.
 
     Ends when ``balls`` outcomes are known, ``rallies`` that count are over, ``seconds`` have passed, or the operator
     quits. 0: all went well, 1: it ended early, 130: ended by Ctrl-C, SIGTERM or a closed terminal. The summary is
@@ -67,7 +71,12 @@ def run(
                 View(console, f"{artefact} on {session.robot.name}") as view,
             ):
                 controls = Controls(session, keyboard, view, rig is not None)
-                problem = _Play(session, rig, controls, played, balls, rallies, seconds, stop).run()
+                companion = accompany(session) if accompany is not None else None
+                try:
+                    problem = _Play(session, rig, controls, played, balls, rallies, seconds, stop, companion).run()
+                finally:
+                    if companion is not None:
+                        companion.close()
             if stop.is_set():
                 raise KeyboardInterrupt
             status = 1 if problem else 0
@@ -105,6 +114,19 @@ def _finish(summary: dict[str, Any], config: RobotConfig, log_file: Path | None,
     session_report.show(console, summary, path)
 
 
+class Companion(Protocol):
+    """Goes along with a session. Nothing of it may wait: the robot's keys are read in between."""
+
+    def take(self, message: Message) -> None:
+        """Takes a message of the control process."""
+
+    def look(self) -> None:
+        """Called some ten times a second."""
+
+    def close(self) -> None:
+        """The session is over."""
+
+
 @dataclass
 class _Play:
     """The loop between the first ball and the last."""
@@ -117,6 +139,7 @@ class _Play:
     rallies: int | None
     seconds: float | None
     stop: threading.Event
+    companion: Companion | None = None
     faults_in_a_row: int = 0
     heard: float = 0.0  # when the last ball was played
 
@@ -130,6 +153,8 @@ class _Play:
                 break
             for message in self.session.messages(0.1):
                 self._take(message)
+            if self.companion is not None:
+                self.companion.look()
             key = self.controls.pressed()
             if key == QUIT:
                 break
@@ -141,6 +166,8 @@ class _Play:
 
     def _take(self, message: Message) -> None:
         self.controls.take(message)
+        if self.companion is not None:
+            self.companion.take(message)
         console = self.session.console
         if isinstance(message, Played):
             self.heard = time.monotonic()

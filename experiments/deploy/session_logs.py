@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
+from mjx_tt.diagnosis.logs import TURN
 from mjx_tt.robot import robots
 from mjx_tt.robot.robots import Robot
 from robot_io.log import SessionLog, read
@@ -41,7 +44,7 @@ def load(path: Path, robot: Robot | None = None) -> tuple[tuple[Trajectory, ...]
             f"{path}: a session of {played.robot}, whose joints are {', '.join(played.joints)}; --robot is "
             f"{wanted.name}, allowed is {played.robot}"
         )
-    return flights(log), _joints(log, wanted)
+    return flights(log), joints_of([log], wanted)
 
 
 def flights(log: SessionLog) -> tuple[Trajectory, ...]:
@@ -62,16 +65,35 @@ def flights(log: SessionLog) -> tuple[Trajectory, ...]:
     return tuple(out)
 
 
-def _joints(log: SessionLog, robot: Robot) -> tuple[JointRecord, ...]:
-    states, commands = log.joints, log.commands
-    if states.time.size < 2 or commands.time.size < 2:
+def split_by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
+    """A rally's track from each stroke of the person to the next one, the robot's hit between them."""
+    cuts, away, farthest = [0], False, 0  # away from the robot; sample at which the ball was farthest that way
+    y = track.position[1]
+    for i in range(len(y)):
+        ahead = y[i] - y[farthest] if away else y[farthest] - y[i]
+        if ahead >= 0.0:
+            farthest = i
+        elif -ahead > TURN:
+            if away:
+                cuts.append(farthest)
+            away, farthest = not away, i
+    return tuple(track.part(a, b) for a, b in pairwise([*cuts, len(y)]))
+
+
+def joints_of(logs: Sequence[SessionLog], robot: Robot) -> tuple[JointRecord, ...]:
+    """Each joint's commands and positions over the files of a session, in their order."""
+    states, commands = [log.joints for log in logs], [log.commands for log in logs]
+    sent, first = np.unique(np.concatenate([c.time for c in commands]), return_index=True)
+    time = np.concatenate([s.time for s in states])
+    position, velocity = (
+        np.concatenate(parts, axis=1) for parts in ([s.position for s in states], [c.sent for c in commands])
+    )
+    if time.size < 2 or sent.size < 2:
         return ()
-    ticks, sent = np.unique(commands.time, return_index=True)
     out = []
-    for j, name in enumerate(log.robot.joints):
-        known = np.flatnonzero(np.isfinite(states.position[j]))  # arm and gantry report by turns
-        moments, first = np.unique(states.time[known], return_index=True)
-        if moments.size > 1 and moments[-1] - max(moments[0], ticks[0]) >= SHORTEST:
-            positions = states.position[j, known[first]]
-            out.append(JointRecord(name, ticks, commands.sent[j, sent], moments, positions, robot=robot))
+    for j, name in enumerate(logs[0].robot.joints):
+        known = np.flatnonzero(np.isfinite(position[j]))  # arm and gantry report by turns
+        moments, kept = np.unique(time[known], return_index=True)
+        if moments.size > 1 and moments[-1] - max(moments[0], sent[0]) >= SHORTEST:
+            out.append(JointRecord(name, sent, velocity[j, first], moments, position[j, known[kept]], robot=robot))
     return tuple(out)

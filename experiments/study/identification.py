@@ -31,6 +31,7 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 from mjx_tt.sim.randomisation import Randomised, Range, Samples
 
+HitLog = tuple[Sequence[Trajectory], Sequence[JointRecord]]  # balls with hits, the joints by the same clock
 BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
 
 
@@ -65,12 +66,27 @@ def identify(
     balls = found.balls
     if len(balls) > most:
         balls = tuple(balls[i] for i in np.sort(np.random.default_rng(0).permutation(len(balls))[:most]))
+    return identify_world(balls, found.joints, [_read_hits(folder) for folder in hits], believed, before, seconds)
+
+
+def identify_world(
+    balls: Sequence[Trajectory],
+    joints: Sequence[JointRecord],
+    hits: Sequence[HitLog],
+    believed: ModelFile,
+    before: Sequence[Range],
+    seconds: float = 60.0,
+) -> ModelFile:
+    """``identify`` from what is in the logs already; hits may be those of the balls themselves."""
     ranges = {one.path: (one.low, one.high) for one in before}
-    arm, axes = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES))
+    arm, axes, high = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES, SEEN_HIGH))
     known = delays.compute_moments(ranges, arm)
-    seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
+    seen = {path: normal for path, normal in known.items() if path != SEEN_HIGH}
+    if SEEN_HIGH in known:  # beside what the model has of it already
+        mean, deviation = known[SEEN_HIGH]
+        seen[HEIGHT] = mean - high, deviation
     balls_fit = of_balls.fit(balls, believed.model, seen)
-    joints_fit = of_joints.fit(cut_middle(found.joints, seconds), believed.model, known) if found.joints else None
+    joints_fit = of_joints.fit(cut_middle(joints, seconds), believed.model, known) if joints else None
     hits_fit = _fit_hits(balls_fit, hits, believed.model, known)
     parts = [] if joints_fit is None else [joints_fit.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
@@ -84,7 +100,9 @@ def identify(
         parts.append(delays.draw_unseen(ranges, arm, unseen, of_balls.DRAWS))
     # In the table frame it is the camera that is off, not the table's height: no ball before a hit can tell them apart.
     of_flight = balls_fit.samples(lift)
-    every = [replace(of_flight, paths=tuple(SEEN_HIGH if p == HEIGHT else p for p in of_flight.paths)), *parts]
+    offset = np.where(np.array(of_flight.paths) == HEIGHT, high, 0.0)
+    paths = tuple(SEEN_HIGH if path == HEIGHT else path for path in of_flight.paths)
+    every = [replace(of_flight, paths=paths, values=of_flight.values + offset), *parts]
     drawn = np.concatenate([one.values for one in every], axis=1)  # row by row side by side
     drawn_paths = tuple(path for one in every for path in one.paths)
     samples = delays.shift_command(Samples(drawn_paths, drawn, np.ones(len(drawn))), axes)
@@ -92,7 +110,8 @@ def identify(
     others: list[Randomised] = [one for one in before if one.path not in settled]
     covered = settled | {one.path for one in before}
     others += [one for one in believed.randomise if not set(one.paths) & covered]
-    centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
+    centre = {HEIGHT: models.paths(believed.model)[HEIGHT]}
+    centre |= dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
     made_of = {
         "flights": balls_fit.problem.grid.n,
         "hits": 0 if hits_fit is None else hits_fit.hits,
@@ -114,28 +133,32 @@ def cut_middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRec
 
 
 def _fit_hits(
-    balls_fit: of_balls.BallsTogether, folders: Sequence[Path], world: SimModel, known: of_hits.Prior
+    balls_fit: of_balls.BallsTogether, logs: Sequence[HitLog], world: SimModel, known: of_hits.Prior
 ) -> of_hits.HitsTogether | None:
-    """Posterior after the hits in these folders; None where there are none, or too few."""
-    if not folders:
+    """Posterior after the hits in these logs; None where there are none, or too few."""
+    if not logs:
         return None
     balls: list[Trajectory] = []
     paths: list[JointPath] = []
-    for i, folder in enumerate(folders):
+    for i, (played, joints) in enumerate(logs):
         later = CLOCK * i
-        data, joints = read(folder / BALLS), read_robot_csv(folder / ROBOT_FILES[0], folder / ROBOT_FILES[1])
-        if not isinstance(data, Dataset):
-            raise ValueError(f"{folder / BALLS}: holds no trajectories")
-        balls += [replace(t, time=t.time + later) for t in data.trajectories]
+        balls += [replace(t, time=t.time + later) for t in played]
         path = joint_path(joints, world)
         if path is None:
-            raise ValueError(f"{folder}: not all joints are in it; hits need all eight")
+            raise ValueError("not all joints are in a log; hits need all eight")
         paths.append(JointPath(tuple(t + later for t in path.time), path.position))
     times, places = (
         tuple(map(np.concatenate, zip(*(getattr(path, name) for path in paths), strict=True)))
         for name in ("time", "position")
     )
     return of_hits.fit(balls_fit, balls, JointPath(times, places), known)
+
+
+def _read_hits(folder: Path) -> HitLog:
+    data, joints = read(folder / BALLS), read_robot_csv(folder / ROBOT_FILES[0], folder / ROBOT_FILES[1])
+    if not isinstance(data, Dataset):
+        raise ValueError(f"{folder / BALLS}: holds no trajectories")
+    return data.trajectories, joints
 
 
 def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ from experiments.study.analysis import scoring
 from experiments.study.target_domain.lab_logs import HitLog
 from experiments.study.workflow import Step, Waiting, derive_seed
 from experiments.training import finalize
-from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
+from mjx_tt.diagnosis.logs import ROBOT_FILES, before_racket, load_logs
 from mjx_tt.rally.end_reasons import End
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
@@ -118,7 +117,7 @@ class RobotWorld:
         if not found:
             raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
         flights, joints = session_logs.load(found[-1])
-        strokes = (stroke for t in flights for stroke in split_by_stroke(t))
+        strokes = (stroke for t in flights for stroke in session_logs.split_by_stroke(t))
         kept = sorted((t for t in strokes if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
         if not kept or not joints:
             raise RunError(f"{found[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
@@ -158,21 +157,6 @@ def serve_balls(player: str, count: int, seed: int, session: str) -> Dataset:
         if len(found) == before:
             raise RunError(f"{player} serves no ball on the rig")
     return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
-
-
-def split_by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
-    """A rally's track from each stroke of the person to the next one, the robot's hit between them."""
-    cuts, away, farthest = [0], False, 0  # away from the robot; sample at which the ball was farthest that way
-    y = track.position[1]
-    for i in range(len(y)):
-        ahead = y[i] - y[farthest] if away else y[farthest] - y[i]
-        if ahead >= 0.0:
-            farthest = i
-        elif -ahead > TURN:
-            if away:
-                cuts.append(farthest)
-            away, farthest = not away, i
-    return tuple(track.part(a, b) for a, b in pairwise([*cuts, len(y)]))
 
 
 def export_once(trained: TrainedPolicy, console: Console) -> Path:

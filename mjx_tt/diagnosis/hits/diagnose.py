@@ -76,7 +76,7 @@ def diagnose_hits(
     theta = np.concatenate([found.search.at.theta, np.zeros(len(effects))])
     start = first_fit(problem, theta, None if found.search.prior is None else found.search.prior.mean, incoming)
     change = np.zeros(len(effects))
-    y, jacobian, hit = _compare(problem, theta, start, incoming)
+    y, jacobian, hit = compare_returns(problem, theta, start, incoming)
     first, usable = y, np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
     if usable.sum() < FEWEST_HITS:
         return None
@@ -84,7 +84,7 @@ def diagnose_hits(
         if round_:
             now = theta.copy()
             now[-len(effects) :] = change
-            y, jacobian, _ = _compare(problem, now, start, incoming)
+            y, jacobian, _ = compare_returns(problem, now, start, incoming)
         target = y + np.einsum("kcn,k->cn", jacobian, change)
         chosen, values, errors, rated = _choose(target[:, usable], jacobian[:, :, usable], effects)
         change = np.zeros(len(effects))
@@ -108,7 +108,7 @@ def diagnose_hits(
     quiet = tuple(e.name for e, ok in zip(effects, could, strict=True) if not ok and e.name not in named)
     now = theta.copy()
     now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects, strict=True)]
-    after, _, _ = _compare(problem, now, start, incoming)
+    after, _, _ = compare_returns(problem, now, start, incoming)
     return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
 
 
@@ -142,7 +142,7 @@ def part(found: BallFindings, hits: HitFindings | None, without: Container[str])
     return Part(tuple(named), not_excited=hits.quiet)
 
 
-def _compare(
+def compare_returns(
     problem: BallProblem, theta: np.ndarray, start: np.ndarray, incoming: Bool[np.ndarray, "T n"]
 ) -> tuple[Float[np.ndarray, "6 n"], Float[np.ndarray, "K 6 n"], Float[np.ndarray, " n"]]:
     """Differences (6, n) behind the paddle, their derivatives (K, 6, n) by the paddle's effects, and hit times (n,)."""

@@ -56,22 +56,22 @@ class Grid:
         return len(self.mask) - 1 - np.argmax(self.mask[::-1], axis=0)
 
 
-def grid(trajectories: Sequence[Trajectory]) -> Grid:
-    """Puts trajectories on one padded grid."""
+def grid(trajectories: Sequence[Trajectory], steps: int = 0, samples: int = 0) -> Grid:
+    """Puts trajectories on one padded grid, of at least so many steps and samples."""
     counts = [np.maximum(np.ceil(np.diff(t.time) / LONGEST_STEP * (1.0 - 1e-9)), 1.0).astype(int) for t in trajectories]
-    n, samples = len(trajectories), max(map(len, trajectories))
-    length = -(-max(int(c.sum()) for c in counts) // PAD) * PAD
-    steps, index, time = np.zeros((length, n)), np.zeros((samples, n), int), np.zeros((samples, n))
+    n, samples = len(trajectories), max(samples, *map(len, trajectories))
+    length = -(-max(steps, *(int(c.sum()) for c in counts)) // PAD) * PAD
+    step, index, time = np.zeros((length, n)), np.zeros((samples, n), int), np.zeros((samples, n))
     measured, mask = np.zeros((3, samples, n)), np.zeros((samples, n), bool)
     for i, (t, count) in enumerate(zip(trajectories, counts, strict=True)):
         k, m = len(t), int(count.sum())
-        steps[:m, i] = np.repeat(np.diff(t.time) / count, count)
+        step[:m, i] = np.repeat(np.diff(t.time) / count, count)
         index[1:k, i] = np.cumsum(count)
         index[k:, i] = m
         time[:k, i], time[k:, i] = t.time - t.time[0], t.time[-1] - t.time[0]
         measured[:, :k, i], measured[:, k:, i] = t.position, t.position[:, -1:]
         mask[:k, i] = True
-    return Grid(steps, index, time, measured, mask)
+    return Grid(step, index, time, measured, mask)
 
 
 def picked(g: Grid, index: Int[np.ndarray, " m"]) -> Grid:

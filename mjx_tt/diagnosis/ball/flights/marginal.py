@@ -105,6 +105,24 @@ def products(linear: Linear, flights: StartsOut) -> Products:
     )
 
 
+def own_unknowns_out(
+    p: Products, prior: SpinPrior | None, scatter: Float[np.ndarray, 3]
+) -> tuple[Float[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
+    """Each ball's score about each effect and its information, spin and kick integrated out as they are distributed."""
+    n, precision, middle = len(p.gram), np.zeros((len(p.gram), 6, 6)), np.zeros((len(p.gram), 6))
+    precision[:, 3:, 3:] = _of_kicks(scatter)
+    used = slice(3, 6)
+    if prior is not None:
+        mean, precision[:, :3, :3] = prior.of_balls(n, TINY)
+        middle[:, :3], used = mean.T, slice(0, 6)
+    own = np.linalg.inv((p.own + precision)[:, used, used])
+    pulled = (p.own_right + np.einsum("nab,nb->na", precision, middle))[:, used]
+    mix = p.own_effect[:, used].swapaxes(1, 2) @ own
+    score = p.right - np.einsum("nka,na->nk", mix, pulled)
+    information = np.einsum("nkk->nk", p.gram) - np.einsum("nka,nak->nk", mix, p.own_effect[:, used])
+    return score, information
+
+
 def distributions(
     p: Products, theta: Float[np.ndarray, " K"], prior: SpinPrior | None, scatter: Float[np.ndarray, 3]
 ) -> tuple[SpinPrior | None, Float[np.ndarray, 3]]:

@@ -16,7 +16,7 @@ from ballmodel.trajectory import Trajectory
 from experiments import measurements
 from experiments.config import study as study_config
 from experiments.config.study import PRIOR
-from experiments.deploy import play
+from experiments.deploy import play, session_logs
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import RunError
 from experiments.finetuning import loop
@@ -54,7 +54,7 @@ def test_a_rallys_track_is_parted_at_the_persons_strokes():
     time = np.arange(0.0, 2.2, 0.008)
     y = np.interp(time, *zip(*places, strict=True)) + np.random.default_rng(0).normal(0.0, 0.003, time.size)
     track = Trajectory("s", "1", time, np.stack([0.0 * y, y, 0.2 + 0.0 * y]))
-    parts = play_on_robot.split_by_stroke(track)
+    parts = session_logs.split_by_stroke(track)
     assert [round(float(p.time[0]), 1) for p in parts] == [0.0, 1.0] and sum(map(len, parts)) == time.size
     assert all(p.position[1].min() < -1.1 < 1.1 < p.position[1, 0] for p in parts)
 

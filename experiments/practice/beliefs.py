@@ -1,0 +1,81 @@
+"""What a session believes of its world, and how two beliefs differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballmodel.trajectory import Trajectory
+from experiments.config.prior import PRIOR
+from experiments.study import identification
+from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import ModelFile
+from mjx_tt.sim.randomisation import Samples
+
+SURE = 4.0  # deviations by which a parameter that is named has moved
+LARGE = 0.05  # of what may change of a parameter, below which it is not named
+NAMED = 3  # parameters in a sentence, at most
+WIDER = 3.0  # times the prior's range: what may change is more than what an installation is off by
+
+
+def _widen(path: str, low: float, high: float) -> list[float]:
+    """WIDER times the range, within what the parameter may be."""
+    (least, most), middle, half = models.bounds(path), 0.5 * (low + high), 0.5 * WIDER * (high - low)
+    return [max(middle - half, least), min(middle + half, most)]
+
+
+# What may change within a session: worn rubber, another table, a fan, a tripod that was kicked, a clock that slipped.
+CHANGES: dict[str, list[float]] = {
+    **{path: _widen(path, *ends) for path, ends in PRIOR.items() if path != "sensing.ball_noise"},
+    **{f"ball.flight.wind_{axis}": [-1.0, 1.0] for axis in "xy"},  # [m/s]
+}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter that two identifications have at different values, with the later one's 90 % interval."""
+
+    path: str
+    before: float
+    after: float
+    low: float
+    high: float
+    deviations: float
+
+    def __str__(self) -> str:
+        return f"{self.path} {self.before:.4g} -> {self.after:.4g} ({self.low:.4g} to {self.high:.4g})"
+
+
+def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believed: ModelFile) -> ModelFile:
+    """The world after these balls, hits among them, and the joints meanwhile. Raises ValueError where they are few."""
+    ranges = identification.read_prior(CHANGES, "changes")
+    return identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
+
+
+def compare(before: ModelFile, after: ModelFile) -> tuple[Change, ...]:
+    """What has changed between two identified worlds, the surest first."""
+    old, new = (_distributions(world) for world in (before, after))
+    found = []
+    for path in old.keys() & new.keys():
+        a, b = old[path], new[path]
+        shift, error = b.mean() - a.mean(), float(np.hypot(a.std(), b.std()))
+        low, high = CHANGES[path]
+        if abs(shift) > SURE * error and abs(shift) > LARGE * (high - low):
+            found.append(Change(path, a.mean(), b.mean(), *np.quantile(b, (0.05, 0.95)), abs(shift) / error))
+    return tuple(sorted(found, key=lambda change: -change.deviations))
+
+
+def say(changes: Sequence[Change]) -> str:
+    """One sentence about what has changed."""
+    if not changes:
+        return "no parameter of the model has changed beyond chance"
+    return "; ".join(str(change) for change in changes[:NAMED])
+
+
+def _distributions(world: ModelFile) -> dict[str, np.ndarray]:
+    """Draws of each parameter that logs decided, by dotted path."""
+    samples = [one for one in world.randomise if isinstance(one, Samples)]
+    return {path: one.values[:, i] for one in samples for i, path in enumerate(one.paths) if path in CHANGES}
