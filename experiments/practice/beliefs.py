@@ -10,6 +10,7 @@ import numpy as np
 from ballmodel.trajectory import Trajectory
 from experiments.config.prior import PRIOR
 from experiments.study import identification
+from experiments.study.analysis import delays
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
@@ -18,6 +19,7 @@ from mjx_tt.sim.randomisation import Samples
 SURE = 4.0  # deviations by which a parameter that is named has moved
 LARGE = 0.05  # of what may change of a parameter, below which it is not named
 NAMED = 3  # parameters in a sentence, at most
+NOISE = "sensing.ball_noise"
 WIDER = 3.0  # times the prior's range: what may change is more than what an installation is off by
 
 
@@ -29,7 +31,7 @@ def _widen(path: str, low: float, high: float) -> list[float]:
 
 # What may change within a session: worn rubber, another table, a fan, a tripod that was kicked, a clock that slipped.
 CHANGES: dict[str, list[float]] = {
-    **{path: _widen(path, *ends) for path, ends in PRIOR.items() if path != "sensing.ball_noise"},
+    **{path: _widen(path, *ends) for path, ends in PRIOR.items() if path != NOISE},
     **{f"ball.flight.wind_{axis}": [-1.0, 1.0] for axis in "xy"},  # [m/s]
 }
 
@@ -50,9 +52,23 @@ class Change:
 
 
 def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believed: ModelFile) -> ModelFile:
-    """The world after these balls, hits among them, and the joints meanwhile. Raises ValueError where they are few."""
-    ranges = identification.read_prior(CHANGES, "changes")
-    return identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
+    """The world after these balls, hits among them, and the joints meanwhile. Raises ValueError where they are few.
+
+    What these logs do not decide is drawn as before, at first from the prior: one program takes all worlds.
+    """
+    ranges = identification.read_prior({**CHANGES, NOISE: PRIOR[NOISE]}, "changes")
+    found = identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
+    samples = next(one for one in found.randomise if isinstance(one, Samples))
+    before, rng = _distributions(believed), np.random.default_rng(len(balls))
+    columns = dict(zip(samples.paths, samples.values.T, strict=True))
+    for path in CHANGES:
+        if path not in columns and path != delays.ARM:
+            columns[path] = before.get(path, rng.uniform(*PRIOR.get(path, (0.0, 0.0)), len(samples.values)))
+    ordered = sorted(columns)
+    whole = Samples(tuple(ordered), np.stack([columns[path] for path in ordered], axis=1), samples.weight)
+    others = tuple(one for one in found.randomise if not set(one.paths) & columns.keys())
+    centre = {path: float(column.mean()) for path, column in columns.items()}
+    return ModelFile(models.with_values(found.model, centre), (whole, *others), found.provenance)
 
 
 def compare(before: ModelFile, after: ModelFile) -> tuple[Change, ...]:

@@ -4,6 +4,7 @@ A score is the derivative of the logarithm of a ball's likelihood by an effect o
 (Rao, Proc. Camb. Phil. Soc. 44, 1948): of the flight up to the robot, with start, spin and the bounce's scatter
 integrated out; of the return behind a hit, whose six numbers count as they are as well; and of each joint's motion
 meanwhile. In the believed world scores scatter about a constant. A change moves those of the effects that look like it.
+A large one bends flights more than derivatives tell; how badly flights and returns fit shows it all the same.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ from robot_io.contract import JOINT_NAMES
 FLIGHT_EFFECTS = tuple(e for e in EFFECTS if e.fit and not e.at_paddle and not e.made_of)
 HIT_EFFECTS = tuple(e for e in EFFECTS if e.at_paddle)
 JOINT_EFFECTS = ("lag", "velocity_gain", "action_delay")
-RETURN = tuple(f"return_{what}_{axis}" for what in ("place", "velocity") for axis in "xyz")
+RETURN = (*(f"return_{what}_{axis}" for what in ("place", "velocity") for axis in "xyz"), "return_misfit")
 NAMES = (
     *(e.name for e in FLIGHT_EFFECTS),
+    "flight_misfit",
     *(e.name for e in HIT_EFFECTS),
     *RETURN,
     *(f"{joint}.{effect}" for joint in JOINT_NAMES for effect in JOINT_EFFECTS),
@@ -55,6 +57,7 @@ class Scorer:
         self._spins = SpinPrior(mean, std) if std.any() and model.ball.flight.magnus_coefficient else None
         self._noise: noise.Noise | None = None
         self._root: Float[np.ndarray, "6 6"] | None = None
+        self._usual = np.zeros((6, 1))  # return, which the model is off by
         self._sizes: dict[str, tuple[int, int]] = {}
 
     def score(self, balls: Sequence[Trajectory], joints: Sequence[JointRecord]) -> Float[np.ndarray, "n M"]:
@@ -63,7 +66,8 @@ class Scorer:
         balls: from the person's paddle on, with their returns; joints: on the same clock, none or all eight.
         """
         found = np.full((len(balls), len(NAMES)), np.nan)
-        first, second = len(FLIGHT_EFFECTS), len(FLIGHT_EFFECTS) + len(HIT_EFFECTS) + len(RETURN)
+        first = len(FLIGHT_EFFECTS) + 1
+        second = first + len(HIT_EFFECTS) + len(RETURN)
         incoming = [(i, flown[0]) for i, t in enumerate(balls) if (flown := flights([t])) and _approaches(flown[0])]
         if incoming:
             rows, flown = zip(*incoming, strict=True)
@@ -98,7 +102,8 @@ class Scorer:
         own = replace(self._noise, frame=frame, scale=scale, scatter=BOUNCE_SCATTER)
         out = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, g), problem)
         score, information = marginal.own_unknowns_out(marginal.products(linear, out), spins, BOUNCE_SCATTER)
-        return _standardise(score, information)
+        misfit = np.log(np.sqrt((linear.residual**2).sum(axis=(0, 1)) / g.mask.sum(axis=0)))
+        return np.concatenate([_standardise(score, information), misfit[:, None]], axis=1)
 
     def _of_hits(self, pairs: Sequence[tuple[Trajectory, int]], path: object) -> Float[np.ndarray, "n H"]:
         whole, before = [t for t, _ in pairs], np.array([n for _, n in pairs])
@@ -114,10 +119,12 @@ class Scorer:
         if self._root is None:
             if usable.sum() < len(RETURN):
                 return np.full((len(pairs), len(HIT_EFFECTS) + len(RETURN)), np.nan)
-            self._root = spread(y[:, usable] - np.median(y[:, usable], axis=1, keepdims=True))[0]
-        j, t = np.einsum("cd,kdn->kcn", self._root, jacobian), self._root @ y
+            self._usual = np.median(y[:, usable], axis=1, keepdims=True)
+            self._root = spread(y[:, usable] - self._usual)[0]
+        j, t = np.einsum("cd,kdn->kcn", self._root, jacobian), self._root @ (y - self._usual)
         scores = _standardise(np.einsum("kcn,cn->nk", j, t), np.einsum("kcn,kcn->nk", j, j))
-        return np.where(usable[:, None], np.concatenate([scores, y.T], axis=1), np.nan)
+        misfit = np.log(np.linalg.norm(t, axis=0) + LEAST)
+        return np.where(usable[:, None], np.concatenate([scores, y.T, misfit[:, None]], axis=1), np.nan)
 
     def _of_joints(self, joints: Sequence[JointRecord], begin: float, end: float) -> Float[np.ndarray, " J"]:
         by_name, found = {r.joint: r for r in joints}, []

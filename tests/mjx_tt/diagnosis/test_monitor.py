@@ -99,7 +99,7 @@ def scorer() -> tuple[Scorer, np.ndarray]:
     [
         ({}, None),
         ({"restitution": 0.87}, "table_restitution"),
-        ({"wind_x": 2.0}, "wind_x"),
+        ({"wind_x": 2.0}, "flight_misfit"),
         ({"drag_coefficient": 0.65}, "drag_coefficient"),
         ({"height": -0.02}, "table_height"),
     ],
