@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from dataclasses import dataclass
 from typing import TypeVar
 
 import jax
@@ -28,6 +27,7 @@ from mjx_tt.env.episode import Episodes, EpisodeState, FixedAction, Return, resh
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import add_weighted, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import HISTORY, N_OBSERVATION
@@ -42,8 +42,7 @@ OBSERVATION_SIZE = HISTORY * N_OBSERVATION  # of the paper's robot
 FEWEST_FLOWN = 16  # balls flown out together, at least
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EnvState:
     """State of an environment between steps; batch axes last."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.actuators import Drives, DriveState
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
@@ -41,8 +41,7 @@ class Controller(Protocol):
         ...
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class FixedAction:
     """A controller with an action decided outside."""
 
@@ -56,8 +55,7 @@ class FixedAction:
         return self.action, ()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Episodes:
     """The random part of a batch of episodes."""
 
@@ -74,8 +72,7 @@ def reshape_episodes(episodes: Episodes, *batch: int) -> Episodes:
     return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, episodes)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EpisodeConstants:
     """Delays, drives and camera of the episodes, computed once before the loop."""
 
@@ -86,8 +83,7 @@ class EpisodeConstants:
     camera: Camera | None
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Accumulators:
     """Running quantities of phase 1."""
 
@@ -99,8 +95,7 @@ class Accumulators:
     terms: dict[str, Float[Array, "*batch"]]  # of the reward terms per control step, sums over the steps
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EpisodeState:
     """State of phase 1 between control steps."""
 
@@ -124,8 +119,7 @@ class EpisodeState:
     accumulators: Accumulators
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Return:
     """Outcome of phase 2."""
 

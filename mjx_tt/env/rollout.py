@@ -8,7 +8,7 @@ perturbation axis can be split over devices (jax.sharding): every device runs it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -27,6 +27,7 @@ from mjx_tt.env.episode import HIT, MISSED, RETURNED, Controller, Episodes
 from mjx_tt.env.policy import controller
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, add_weighted, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Drawing, Randomised
@@ -38,8 +39,7 @@ AXIS = "perturbation"
 CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RolloutResult:
     """Results of a batch of episodes."""
 

@@ -22,13 +22,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
+from mjx_tt.pytrees import pytree
 from robot_io.contract import JointLimits
 
 # One episode on the robot has plain numbers, a batch in simulation arrays (...).
@@ -36,8 +36,7 @@ Flag: TypeAlias = Bool[Array | np.ndarray, "*batch"] | np.bool_ | bool
 Number: TypeAlias = Float[Array | np.ndarray, "*batch"] | np.floating | float
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ControlStep:
     """One control period under the policy, as it is at its end. SI units, the batch last."""
 
@@ -58,8 +57,7 @@ class ControlStep:
     period: float = field(metadata={"static": True})  # [s] of control
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PlayedBall:
     """One ball once all is over. SI units, the batch last."""
 
@@ -74,8 +72,7 @@ class PlayedBall:
     fault: Flag = False  # the robot stopped itself; never in a single episode of the simulation
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Sensed:
     """Measurements that the policy may see at a control step. SI units, the batch last."""
 

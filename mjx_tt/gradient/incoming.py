@@ -5,8 +5,6 @@ So its flights need no derivatives, and all of them are known before the robot m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -17,11 +15,11 @@ from ballmodel.state import BallState, where
 from mjx_tt.env import observation
 from mjx_tt.env.episode import EpisodeConstants, Episodes
 from mjx_tt.env.task import Task
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.sensors import Filters
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Incoming:
     """Balls that nobody plays, at the S + 1 ends of S substeps; L episodes.
 

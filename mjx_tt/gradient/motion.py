@@ -7,8 +7,6 @@ is left out, that joints disturb each other and that the load changes a loop, is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,13 +17,13 @@ from mjx_tt.env import observation
 from mjx_tt.env.episode import Controller, EpisodeConstants, Episodes
 from mjx_tt.env.task import Task, compose_observation
 from mjx_tt.gradient.incoming import Incoming
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.kinematics import Joints
 from mjx_tt.sim import actuators, latency
 from robot_io.limits import limit_velocity
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Motion:
     """The robot under a policy while nothing is hit, through T control periods of S substeps in all.
 

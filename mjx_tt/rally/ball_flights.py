@@ -6,9 +6,8 @@ Batch axis last; (L,) unless noted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -21,6 +20,7 @@ from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
 from mjx_tt.env.return_flight import FLOOR
 from mjx_tt.lanes.loop import while_any
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS, JointLimits
 
@@ -30,8 +30,7 @@ HOME_DELAY = 0.1  # [s] to brake after the hit (estimate)
 READY = 0.06  # [s] between the bounce and the earliest contact (estimate)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Sent:
     """Outcome of the players' balls if nobody plays them."""
 
@@ -41,8 +40,7 @@ class Sent:
     landing: Float[Array, "2 L"]  # [m] there
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Meeting:
     """The robot's returns as they come to the players."""
 

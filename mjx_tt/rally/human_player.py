@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -33,6 +33,7 @@ from ballmodel.io.ranges import FINITE
 from ballmodel.io.validation import Finite, Increasing, find, validate
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, row
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally.shots import aim_stroke, estimate_fall_seconds, estimate_stroke_seconds, perturb_stroke
 
 Number: TypeAlias = Annotated[jax.Array | float, FINITE]  # a file has one number
@@ -51,8 +52,7 @@ LOB_SPIN = 0.3  # share of a stroke's spin that a lob has
 SPIN_UNIT = 100.0  # [rad/s] of incoming spin: one unit
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Spread:
     """A quantity that varies from ball to ball: half a normal distribution to each side of the usual value, cut off."""
 
@@ -79,8 +79,7 @@ class Spread:
         return self.usual + share * jnp.where(n > 0.0, self.high - self.usual, self.usual - self.low)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class FirstBalls:
     """First balls of a player. The way to the landing point and the speed ask for a climb; the bounds come
     after."""
@@ -97,8 +96,7 @@ class FirstBalls:
     mishit: Number  # share of balls with four times the errors
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Strokes:
     """Answers of a player to returns."""
 
@@ -114,8 +112,7 @@ class Strokes:
     attack: Number  # [1/s] speed added per height of the contact over COMFORTABLE_HEIGHT
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Ability:
     """Ability of a player. Errors are those of an easy ball, as standard deviations."""
 
@@ -132,8 +129,7 @@ class Ability:
     misread: Number  # [rad] error upwards per SPIN_UNIT of incoming topspin that the player is not used to
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Spin:
     """Spin that a player's strokes give [rad/s]."""
 
@@ -142,8 +138,7 @@ class Spin:
     side_spread: Number
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Person:
     """Changes of a player in the course of a session."""
 
@@ -154,8 +149,7 @@ class Person:
     strangeness: Number  # difficulty per unit of surprise by a return
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Player:
     """One virtual person; leaves are scalars, or of the lanes' shape when several are stacked."""
 
@@ -166,8 +160,7 @@ class Player:
     person: Person
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PlayerState:
     """State of a player from ball to ball."""
 
@@ -176,8 +169,7 @@ class PlayerState:
     expected: Float[Array, "3 *batch"]  # [m], [m], [m/s] landing x, y and speed of the robot's returns so far
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Incoming:
     """A robot's return as the player meets it."""
 
@@ -186,8 +178,7 @@ class Incoming:
     seconds: Float[Array, "*batch"]  # from the robot's hit to the contact
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Answer:
     """A player's stroke."""
 

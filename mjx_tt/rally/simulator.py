@@ -11,7 +11,7 @@ home pose: the rally is over, and the next ball is a dummy that only brings it b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -28,6 +28,7 @@ from mjx_tt.env.policy import Policy
 from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally import ball_flights, human_player
 from mjx_tt.rally.ball_flights import drive_home, make_column
 from mjx_tt.rally.end_reasons import End, find_end
@@ -41,8 +42,7 @@ BLIND = 0.003  # probability that the tracker loses a first ball and the robot d
 BY_HAND = 0.5  # share of the dummy balls that are thrown by hand
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Box:
     """Bounds of a ball distribution: position (3), velocity (3), landing (2); (8,) or (8, L)."""
 
@@ -65,8 +65,7 @@ class Box:
         return jnp.all((values >= low) & (values <= high), axis=0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RallyState:
     """Lanes between two turns; the next ball is about to leave the player's paddle."""
 
@@ -77,8 +76,7 @@ class RallyState:
     dummy: Bool[Array, " L"]  # the robot stands in the arm's own home pose
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ShotResult:
     """One turn of every lane."""
 
@@ -99,8 +97,7 @@ class ShotResult:
     observed: Float[Array, "2 observed L"]  # sums over them of what it saw less its mean, and of the squares
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class BallLog:
     """Human hits, up to a capacity per lane; slots past ``count`` are zero."""
 
@@ -121,8 +118,7 @@ class BallLog:
         return self.touch == 1
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RallyResult:
     """Rallies of all lanes."""
 

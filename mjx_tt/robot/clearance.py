@@ -8,7 +8,6 @@ loops.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import jax
@@ -18,6 +17,7 @@ from jaxtyping import Float
 
 from ballmodel.contact import TABLE, Box, box_gap
 from ballmodel.vec import dot
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.chain import Frame
 from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
 from mjx_tt.robot.mjcf import Capsule
@@ -61,8 +61,7 @@ def segment_distance(p1: jax.Array, q1: jax.Array, p2: jax.Array, q2: jax.Array)
     return jnp.sqrt(dot(gap, gap))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Clearances:
     """Smallest gaps [m], (...); negative or zero: in contact."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import jax
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ballmodel.flight import PaddlePose
 from mjx_tt.lanes.functions import sin_cos
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
@@ -46,8 +47,7 @@ def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]
     return transforms
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class LinkPose:
     """World pose of one link's frame, folded scalars."""
 

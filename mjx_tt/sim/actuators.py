@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any
 
 import jax
@@ -35,6 +35,7 @@ from jaxtyping import Float
 from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.vec import Scalars
+from mjx_tt.pytrees import pytree
 from robot_io.contract import JOINT_NAMES, LIMITS
 
 # "No limit" as numbers that no drive reaches: ten times the fastest joint's speed, and up to it within 10 microseconds.
@@ -44,8 +45,7 @@ SHORTEST = 1e-9  # [s], keeps exponents finite
 SWING_DAMPING = 0.1  # ratio z of a flexible mount, estimate: bolted metal without a damper
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class JointDrive:
     """One joint's drive; nominal it does nothing. Every field is a scalar or has the episodes' batch shape.
 
@@ -71,8 +71,7 @@ class JointDrive:
 EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class DriveParams:
     """The eight joints' drives, by ``robot_io.contract.JOINT_NAMES``; another robot's: ``drive_params``."""
 
@@ -96,8 +95,7 @@ def drive_params(joints: tuple[str, ...]) -> Any:
     return jax.tree_util.register_dataclass(made, data_fields=list(joints), meta_fields=[])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Drives:
     """The same by effect, each (n, ...), None where no joint has it: ready for the loop."""
 
@@ -119,8 +117,7 @@ class Drives:
         return self.lag is not None or self.acceleration_limit is not None
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class DriveState:
     """State of the drives; None where an effect has none."""
 

@@ -11,7 +11,6 @@ that of tick n - m after them; a substep in which it changes gets the time-weigh
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +18,12 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int, Shaped
 
+from mjx_tt.pytrees import pytree
+
 SMALLEST = 1e-6  # [s]; a delay of zero reads the end of the period before, which is the same moment
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Delay:
     """A delay split into whole control periods and a rest, each of the batch shape."""
 

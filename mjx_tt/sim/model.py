@@ -32,6 +32,7 @@ from ballmodel.io.atomic_files import replacing
 from ballmodel.io.ranges import Within, find_note, type_hints
 from ballmodel.io.validation import nearest, validate
 from ballmodel.vec import Scalars
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim import randomisation
 from mjx_tt.sim.actuators import JointDrive, drive_params
 from mjx_tt.sim.randomisation import Drawing, Randomised
@@ -41,8 +42,7 @@ from mjx_tt.sim.sensors import SensingParams as SensingParams
 from robot_io.contract import JOINT_NAMES
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class LatencyParams:
     """Gaussian delays, drawn per episode [s]. Means and deviations: the paper's table of sensor latencies.
 
@@ -65,16 +65,14 @@ class LatencyParams:
 LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_action", "festo_action")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ActuationParams:
     """All drives alike: gain of the velocity command before the servo of the MJCF follows it."""
 
     velocity_gain: Annotated[Scalars, Within(-3.0, 3.0)] = 1.0  # reached over commanded velocity
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class BallSpinParams:
     """Spin of the incoming balls at their start [rad/s], Gaussian and drawn per episode.
 
@@ -95,8 +93,7 @@ def _ball() -> BallParams:
     return dataclasses.replace(ball, flight=dataclasses.replace(ball.flight, integrator="midpoint"))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class SimModel:
     """The simulation's parameters; the paper's drag-only ball, integrated to second order.
 
