@@ -160,9 +160,7 @@ class TableTennis(Env):
             back = jax.tree.map(lambda x, new: x.at[..., index].set(new, mode="drop"), back, part)
             return left.at[index].set(False, mode="drop"), back
 
-        zero = jnp.zeros_like(ball.position[0])
-        back = Return(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))
-        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, back))[1]
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, Return.nowhere(ball)))[1]
 
 
 def flatten(history: Float[Array, "8 observed *batch"]) -> Float[Array, "*batch size"]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, UInt32
 
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState
 from mjx_tt.pytrees import pytree
-from mjx_tt.sim.actuators import Drives, DriveState
+from mjx_tt.sim.actuators import DriveState, JointDrive
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.sensors import Camera, Filters
@@ -79,7 +80,7 @@ class EpisodeConstants:
     ball: Delay
     joints: Delay  # (8, ...)
     action: Delay  # (8, ...)
-    drives: Drives
+    drives: JointDrive  # (8, ...) of each effect, as ``actuators.sort_by_effect`` gives them
     camera: Camera | None
 
 
@@ -127,3 +128,9 @@ class Return:
     net_height: Float[Array, "*batch"]  # [m] of the ball's centre there
     returned: Bool[Array, "*batch"]
     landing: Float[Array, "2 *batch"]  # [m] where it came down to the table's height
+
+    @classmethod
+    def nowhere(cls, ball: BallState) -> Return:
+        """Of balls that have not flown yet."""
+        zero = jnp.zeros_like(ball.position[0])
+        return cls(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))

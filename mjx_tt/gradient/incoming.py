@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 
 from ballmodel import flight
 from ballmodel.state import BallState, where
-from mjx_tt.env import observation
 from mjx_tt.env.episode import EpisodeConstants, Episodes
 from mjx_tt.env.task import Task
 from mjx_tt.pytrees import pytree
@@ -41,7 +40,7 @@ def fly_incoming(task: Task, episodes: Episodes, constants: EpisodeConstants, ti
     nothing = jnp.zeros((task.contract.n_joints, *episodes.seed.shape), episodes.ball.position.dtype)
 
     def captured(i: int, ball: BallState, filters: Filters) -> Array:
-        whole = observation.capture(episodes, constants, n, timestep, i, ball, filters, nothing)
+        whole = task.capture(episodes, constants, i, ball, filters, nothing)
         return jnp.concatenate([whole[:3], whole[3 + nothing.shape[0] :]])
 
     def substep(ball: BallState, bounced: Array, live: Array, filters: Filters) -> tuple:

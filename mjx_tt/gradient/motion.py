@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from mjx_tt.env import observation
 from mjx_tt.env.episode import Controller, EpisodeConstants, Episodes
 from mjx_tt.env.task import Task, compose_observation
 from mjx_tt.gradient.incoming import Incoming
@@ -78,12 +77,10 @@ def simulate_motion(
 
     def observe(tick: Array | int, seen: Array, joints: Array, command: Array) -> Array:
         captured = jnp.concatenate([seen[:3], joints, seen[3:]])
-        return compose_observation(
-            config.observations, observation.measure(episodes, constants, captured, command, tick)
-        )
+        return compose_observation(config.observations, task.measure(episodes, constants, captured, command, tick))
 
     def capture(i: int, joints: Array) -> Array:
-        return latency.weigh_capture(constants.joints, i, n, timestep) * joints
+        return latency.weigh_capture(constants.joints, i, timestep) * joints
 
     def step(carry: tuple, now: tuple[Array, Array]) -> tuple[tuple, tuple]:
         robot, command, reference, commands, measured, policy = carry

@@ -355,15 +355,14 @@ def read(path: str | os.PathLike) -> Player:
 
 def to_dict(player: Player) -> dict[str, Any]:
     """The YAML form of a player with scalar leaves."""
-    return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
 
+    def plain(part: Any) -> Any:
+        if not dataclasses.is_dataclass(part):
+            return round(float(part), 4)
+        values = {f.name: plain(getattr(part, f.name)) for f in dataclasses.fields(part)}
+        return list(values.values()) if isinstance(part, Spread) else values
 
-def _plain(player: Any) -> dict[str, Any] | list[float] | float:
-    if isinstance(player, Spread):
-        return [round(float(value), 4) for value in (player.low, player.usual, player.high)]
-    if dataclasses.is_dataclass(player):
-        return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
-    return round(float(player), 4)
+    return plain(player)
 
 
 def stack(players: list[Player]) -> Player:

@@ -16,14 +16,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.partial_params import without_nominal
 from ballmodel.registry import Balls, box_of
 from ballmodel.state import BallState, where
-from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, EpisodeState
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.return_flight import fly_return
@@ -217,7 +216,7 @@ class RallySimulator:
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
         sent = ball_flights.fly_serve(model.ball, ball, self.config.period)
-        robot = self._robot(next(keys), policy, model, ball, state.start)
+        robot = self.task.play(controller_of(policy), self._episodes(next(keys), model, ball, state.start))
         blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
         finite = robot.finite
         fault = ((robot.accumulators.terms["collision"] > 0.0) | ~finite) & ~blind
@@ -268,13 +267,6 @@ class RallySimulator:
             observed=jnp.stack([robot.accumulators.observation, robot.accumulators.observation_sq]),
         )
         return after, result, state.touches + hit.astype(jnp.int32)
-
-    def _robot(
-        self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
-    ) -> EpisodeState:
-        """The robot's part of one episode: its last state."""
-        episodes = self._episodes(key, model, ball, start)
-        return self.task.play(controller_of(policy), episodes)
 
     def _episodes(
         self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
@@ -357,21 +349,12 @@ class RallySimulator:
 def _logged(
     log: BallLog, rally: Int[Array, " L"], shot: ShotResult, keep: Bool[Array, " L"], lane: Int[Array, " L"]
 ) -> BallLog:
-    capacity = log.touch.shape[0]
-    slot = jnp.where(keep, log.count, capacity)
+    slot = jnp.where(keep, log.count, log.touch.shape[0])  # a slot past the end: nothing is written
+    hit, returned = shot.outcome != MISSED, shot.outcome == RETURNED
+    ball = (shot.ball.position, shot.ball.velocity, shot.ball.spin, shot.landing)
+    values = BallLog(rally, shot.touch, *ball, hit, returned, shot.return_landing, log.count + keep.astype(jnp.int32))
 
-    def put(buffer: Array, value: Array | np.ndarray) -> Array:
-        return buffer.at[..., slot, lane].set(value, mode="drop")
+    def write(buffer: Array, value: Array) -> Array:
+        return buffer.at[..., slot, lane].set(value, mode="drop") if buffer.ndim > 1 else value
 
-    return BallLog(
-        rally=put(log.rally, rally),
-        touch=put(log.touch, shot.touch),
-        position=put(log.position, shot.ball.position),
-        velocity=put(log.velocity, shot.ball.velocity),
-        spin=put(log.spin, shot.ball.spin),
-        landing=put(log.landing, shot.landing),
-        hit=put(log.hit, shot.outcome != MISSED),
-        returned=put(log.returned, shot.outcome == RETURNED),
-        return_landing=put(log.return_landing, shot.return_landing),
-        count=log.count + keep.astype(jnp.int32),
-    )
+    return jax.tree.map(write, log, values)

@@ -53,16 +53,21 @@ def _unsupported_options(model: mujoco.MjModel) -> Iterator[str]:
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         yield f"option integrator: only implicitfast is supported, got {integrator.name}"
-    for option in ("density", "viscosity"):
-        if getattr(model.opt, option):
-            yield f"option {option}: must be 0 (no fluid forces), got {getattr(model.opt, option)}"
-    for flag in ("ACTUATION", "GRAVITY", "DAMPER"):
-        if _disabled(model, getattr(_DISABLE, f"mjDSBL_{flag}")):
-            yield f"option flag {flag.lower()}: must stay enabled"
+    yield from altered_forces(model)
     if model.opt.disableactuator:
         yield "option actuatorgroupdisable: disabled actuator groups are not supported"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         yield "option flag sleep: must stay disabled"
+
+
+def altered_forces(model: mujoco.MjModel) -> Iterator[str]:
+    """One sentence for every option that adds forces to the model or takes some away."""
+    for option in ("density", "viscosity"):
+        if value := getattr(model.opt, option):
+            yield f"option {option}: must be 0 (no fluid forces), got {value:g}"
+    for flag in ("ACTUATION", "GRAVITY", "DAMPER"):
+        if _disabled(model, getattr(_DISABLE, f"mjDSBL_{flag}")):
+            yield f"option flag {flag.lower()}: must stay enabled"
 
 
 def _unsupported_joints(model: mujoco.MjModel) -> Iterator[str]:

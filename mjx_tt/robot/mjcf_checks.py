@@ -9,13 +9,12 @@ import mujoco
 import numpy as np
 
 from mjx_tt.robot.chain import body_frames
-from mjx_tt.robot.checks import unsupported
+from mjx_tt.robot.checks import altered_forces, unsupported
 from mjx_tt.robot.mjcf import PADDLE_SITE, capsules
 from mjx_tt.sim.actuators import EFFECTS
 from robot_io.robot_file import RobotFile
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
-_DISABLED = ("ACTUATION", "GRAVITY", "DAMPER")
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _NEEDED_FILES = re.compile(r"<include\b|<(mesh|hfield|skin|model|texture)\b[^>]*\bfile\s*=")
 _REMEDIES = {  # words of ``checks.unsupported``: what to change
@@ -91,15 +90,10 @@ def _drives(file: RobotFile, yaml: str) -> Iterator[str]:
 
 
 def _options(model: mujoco.MjModel, where: str) -> Iterator[str]:
-    for option in ("density", "viscosity"):
-        if getattr(model.opt, option):
-            value = getattr(model.opt, option)
-            yield f"{where}: option {option}: is {value:g}; remove it, fluid forces are not computed"
+    for line in altered_forces(model):
+        yield f"{where}: {line}; remove it"
     if not np.allclose(model.opt.gravity, GRAVITY):
         yield f"{where}: option gravity: is {model.opt.gravity.tolist()}; remove it, the court's is {list(GRAVITY)}"
-    for flag in _DISABLED:
-        if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
-            yield f"{where}: option flag {flag.lower()}: is disabled; remove it, it must stay enabled"
 
 
 def _joints(file: RobotFile, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:

@@ -45,8 +45,8 @@ def split_action_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> De
     return Delay(m.astype(jnp.int32), seconds - m * period)
 
 
-def weigh_capture(delay: Delay, s: Int[Array, ""] | int, substeps: int, timestep: float) -> Array:
-    """Weight of the state at substep boundary ``s`` (0 .. substeps) in the captured state: linear interpolation."""
+def weigh_capture(delay: Delay, s: Int[Array, ""] | int, timestep: float) -> Array:
+    """Weight of the state at a control period's substep boundary ``s`` in the captured one: linear interpolation."""
     return jnp.clip(1.0 - jnp.abs(delay.rest / timestep - s), 0.0, 1.0)
 
 
