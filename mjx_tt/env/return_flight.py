@@ -20,13 +20,16 @@ from mjx_tt.sim.model import SimModel
 FLOOR = -0.76  # [m]
 
 
-def fly_return(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], model: SimModel) -> Return:
-    """Phase 2: flies the balls that were hit until they come down.
+def take_long_steps(params: BallParams) -> BallParams:
+    """The same ball by a step of second order: alone in the air it needs no substeps.
 
-    Alone in the air the ball needs no substeps: one second-order step per control period moves its landing point
-    by less than a millimetre.
+    One step per control period moves its landing point by less than a millimetre.
     """
-    params = replace(model.ball, flight=replace(model.ball.flight, integrator="midpoint"))
+    return replace(params, flight=replace(params.flight, integrator="midpoint"))
+
+
+def fly_return(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], model: SimModel) -> Return:
+    """Phase 2: flies the balls that were hit until they come down."""
 
     def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
         ball, live, outcome = state
@@ -51,4 +54,4 @@ def fly_return(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], 
 
     start = (ball, hit, Return.nowhere(ball))
     lanes = config.lanes and hit.ndim == 1
-    return while_any(lambda s: s[1], step, start, params, limit=config.max_steps, lanes=lanes)[2]
+    return while_any(lambda s: s[1], step, start, take_long_steps(model.ball), limit=config.max_steps, lanes=lanes)[2]

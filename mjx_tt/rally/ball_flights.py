@@ -6,7 +6,6 @@ Batch axis last; (L,) unless noted.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,7 @@ from ballmodel import constants as c
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.return_flight import FLOOR
+from mjx_tt.env.return_flight import FLOOR, take_long_steps
 from mjx_tt.lanes.loop import while_any
 from mjx_tt.pytrees import pytree
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
@@ -49,11 +48,6 @@ class Meeting:
     net: Bool[Array, " L"]  # touched it on the way
 
 
-def _take_long_steps(params: BallParams) -> BallParams:
-    """Alone in the air a ball needs no substeps if they are of second order."""
-    return replace(params, flight=replace(params.flight, integrator="midpoint"))
-
-
 def _count_ticks(period: float) -> int:
     """Control periods that a ball is followed."""
     return math.ceil(LONGEST / period)
@@ -61,7 +55,7 @@ def _count_ticks(period: float) -> int:
 
 def fly_serve(params: BallParams, ball: BallState, period: float) -> Sent:
     """Flies balls (3, L) until they come down, in steps of ``period`` [s]."""
-    params, false = _take_long_steps(params), jnp.zeros(ball.position.shape[1:], bool)
+    params, false = take_long_steps(params), jnp.zeros(ball.position.shape[1:], bool)
     start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
 
     def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
@@ -93,7 +87,7 @@ def fly_to_player(
 
     returned: which balls to fly. The contact is looked for once per ``period`` [s].
     """
-    params, zero = _take_long_steps(params), jnp.zeros_like(ball.position[0])
+    params, zero = take_long_steps(params), jnp.zeros_like(ball.position[0])
     start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
 
     def step(tick: Array, state: tuple, by_lane: tuple, _: tuple) -> tuple:

@@ -184,7 +184,6 @@ class Answer:
 
     ball: BallState  # (3, ...) as it leaves the paddle, or as it came where it was missed
     hit: Bool[Array, "*batch"]
-    difficulty: Float[Array, "*batch"]
     state: PlayerState
 
 
@@ -284,7 +283,7 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
         expected=state.expected + row(jnp.maximum(person.adapting, 0.1)) * (met - state.expected),
     )
     left = BallState(ball.position, jnp.where(hit, velocity, ball.velocity), jnp.where(hit, spin, ball.spin))
-    return Answer(left, hit, hard, after)
+    return Answer(left, hit, after)
 
 
 def difficulty(player: Player, state: PlayerState, incoming: Incoming) -> Float[Array, "*batch"]:

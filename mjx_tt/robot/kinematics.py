@@ -13,11 +13,13 @@ from jaxtyping import Float
 
 from ballmodel.flight import PaddlePose
 from mjx_tt.lanes.functions import sin_cos
-from mjx_tt.pytrees import pytree
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
 Joints: TypeAlias = Float[jax.Array, "n *batch"]  # [m], [m/s] of slides, [rad], [rad/s] of hinges
+
+
+LinkPose: TypeAlias = tuple[f.Matrix, f.Vector]  # rotation and origin of a link's frame, folded scalars
 
 
 def centred_on_anchors(chain: Chain) -> Chain:
@@ -31,10 +33,10 @@ def centred_on_anchors(chain: Chain) -> Chain:
     return replace(chain, links=tuple(links))
 
 
-def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]:
-    """Rotation and origin of every link in its parent's frame at joint positions q (n, ...), folded scalars."""
+def joint_transforms(chain: Chain, q: Joints) -> list[LinkPose]:
+    """Pose of every link in its parent's frame at joint positions q (n, ...)."""
     sin, cos = f.optimization_barrier(sin_cos(q))  # of slides too: one loop over all joints is the cheapest
-    transforms: list[tuple[f.Matrix, f.Vector]] = []
+    transforms: list[LinkPose] = []
     for i, link in enumerate(chain.links):
         if link.slide:
             along = f.matvec(link.rot, link.axis)
@@ -44,14 +46,6 @@ def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]
         # Where the entries are sine, cosine and their negatives there is nothing to store.
         transforms.append((rot if f.are_signs(link.rot, link.axis) else f.optimization_barrier(rot), link.pos))
     return transforms
-
-
-@pytree
-class LinkPose:
-    """World pose of one link's frame, folded scalars."""
-
-    rot: f.Matrix
-    pos: f.Vector
 
 
 class PaddleKinematics:
@@ -70,14 +64,15 @@ class PaddleKinematics:
         for r, p in joint_transforms(self._chain, q):
             pos = f.vadd(pos, f.matvec(rot, p))
             rot, pos = f.optimization_barrier((f.matmul(rot, r), pos))
-            poses.append(LinkPose(rot, pos))
+            poses.append((rot, pos))
         return poses
 
     def point(self, poses: list[LinkPose], link: int, point: np.ndarray) -> f.Vector:
         """World coordinates, as folded scalars, of a point (3,) given in the frame of a link of the original chain."""
         if link == WORLD:
             return f.vector(point)
-        return f.vadd(poses[link].pos, f.matvec(poses[link].rot, f.vector(point - self._anchors[link])))
+        rot, pos = poses[link]
+        return f.vadd(pos, f.matvec(rot, f.vector(point - self._anchors[link])))
 
     def pose(self, q: Joints, qd: Joints) -> PaddlePose:
         """Blade centre [m], unit normal (the site's z axis), velocity [m/s], angular velocity [rad/s], each (3, ...).

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -136,15 +136,11 @@ class ModelFile:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes parameters, ranges and provenance, whole or not at all. Drives only if the model has them."""
-        tree: dict = {}
-        for name, value in paths(self.model).items():
-            if name.startswith("drives.") and self.model.drives is None:
-                continue
-            *groups, leaf = name.split(".")
-            node = tree
-            for group in groups:
-                node = node.setdefault(group, {})
-            node[leaf] = value if isinstance(value, str) else float(value)
+        tree = _nest(
+            (name, value if isinstance(value, str) else float(value))
+            for name, value in paths(self.model).items()
+            if self.model.drives is not None or not name.startswith("drives.")
+        )
         tree["randomise"] = randomisation.to_dict(self.randomise)
         tree["provenance"] = self.provenance
         with replacing(Path(path)) as temporary:
@@ -246,14 +242,9 @@ def from_dict(data: Any, where: str, nominal: SimModel | None = None) -> ModelFi
 @cache
 def file_type(joints: tuple[str, ...] = JOINT_NAMES) -> Any:
     """Type of a model YAML for a robot with these joints: the tree of parameters, none of which is required."""
-    tree: dict[str, Any] = {}
-    for path, note in _notes(joints).items():
-        *groups, leaf = path.split(".")
-        node = tree
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[leaf] = Annotated[float, note] if isinstance(note, Within) else note
-    numbers = {path: note for path, note in _notes(joints).items() if isinstance(note, Within)}
+    notes = _notes(joints)
+    numbers = {path: note for path, note in notes.items() if isinstance(note, Within)}
+    tree = _nest((path, Annotated[float, note] if path in numbers else note) for path, note in notes.items())
     extra = {"randomise": randomisation.file_type(numbers) | None, "provenance": dict[str, Any] | None}
     return _mapping_type("Model", tree | extra)
 
@@ -274,6 +265,18 @@ def _reorder(content: Any, given: Any) -> Any:
     if not isinstance(content, dict):
         return content
     return {str(key): _reorder(content[str(key)], value) for key, value in given.items()}
+
+
+def _nest(leaves: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """The tree of the leaves with these dotted paths."""
+    tree: dict[str, Any] = {}
+    for path, value in leaves:
+        *groups, leaf = path.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[leaf] = value
+    return tree
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
