@@ -30,7 +30,7 @@ from mjx_tt.env.task import add_weighted, evaluate_rewards
 from mjx_tt.pytrees import pytree
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
-from robot_io.contract import HISTORY
+from robot_io.contract import HISTORY, N_OBSERVATION
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an optional engine, is not installed
     from brax.envs import register_environment as register_environment
@@ -38,6 +38,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an opti
 
 T = TypeVar("T")
 
+OBSERVATION_SIZE = HISTORY * N_OBSERVATION  # of the paper's robot
 FEWEST_FLOWN = 16  # balls flown out together, at least
 
 

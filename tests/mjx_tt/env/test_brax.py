@@ -9,7 +9,7 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env.brax import TableTennis
+from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.reward_weights import TERMS
@@ -116,6 +116,6 @@ def test_brax_sees_an_environment_of_any_batch(env):
     for keys, batch in ((jax.random.PRNGKey(3), ()), (raw, (4,)), (jax.random.wrap_key_data(raw), (4,))):
         shapes = jax.eval_shape(env.reset, keys)
         after = jax.eval_shape(env.step, shapes, jax.ShapeDtypeStruct((*batch, env.action_size), jnp.float32))
-        assert shapes.obs.shape == (*batch, HISTORY * N_OBSERVATION) == (*batch, env.observation_size)
+        assert shapes.obs.shape == (*batch, OBSERVATION_SIZE) == (*batch, env.observation_size)
         assert after.reward.shape == after.done.shape == batch
         assert jax.tree.map(lambda x: (x.shape, x.dtype), shapes) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
