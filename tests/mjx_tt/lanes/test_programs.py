@@ -9,6 +9,7 @@ import pytest
 import scipy.special
 
 from mjx_tt.lanes.emitter import Unsupported
+from mjx_tt.lanes.functions import sin_cos
 from mjx_tt.lanes.loop import _by_lanes
 
 L = 37  # two vectors and a part of one
@@ -105,6 +106,18 @@ def test_a_function_is_right_to_some_units_of_the_last_place(function, oracle, l
     wanted = oracle(x.astype(np.float64))
     error = np.abs(by_lanes(function, x) - wanted) / np.spacing(np.abs(wanted).astype(np.float32))
     assert error.max() < units
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("largest", [np.pi, 8000.0])
+def test_sine_and_cosine_are_exact_to_rounding(dtype, largest):
+    angles = np.random.default_rng(2).uniform(-largest, largest, 100_000).astype(dtype)
+    angles[:9] = np.arange(-4, 5) * np.pi / 2
+    with jax.enable_x64(dtype == np.float64):
+        sin, cos = jax.jit(sin_cos)(angles)
+    assert sin.dtype == cos.dtype == dtype
+    for found, exact in ((sin, np.sin(angles.astype(float))), (cos, np.cos(angles.astype(float)))):
+        np.testing.assert_allclose(found, exact, rtol=0, atol=np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize(
