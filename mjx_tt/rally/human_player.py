@@ -234,12 +234,9 @@ def wish(
     player: Player, key: PRNGKeyArray, shape: tuple[int, ...]
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Plane y and height z [m] at which the players mean to take the next return."""
-    plane, height = jax.random.split(key)
-    strokes = player.strokes
-    return (
-        strokes.plane.draw(plane, shape, strokes.steadiness, WIDE),
-        strokes.height.draw(height, shape, strokes.steadiness, WIDE),
-    )
+    strokes, (plane_key, height_key) = player.strokes, jax.random.split(key)
+    plane = strokes.plane.draw(plane_key, shape, strokes.steadiness, WIDE)
+    return plane, strokes.height.draw(height_key, shape, strokes.steadiness, WIDE)
 
 
 def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Incoming, flight: FlightParams) -> Answer:
@@ -255,18 +252,14 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
     p_miss = jnp.clip(ability.miss + jax.nn.sigmoid((hard - ability.limit) / (0.12 * ability.limit)) + far, 0.0, 1.0)
     hit = jax.random.uniform(next(keys), shape) >= p_miss
 
-    target = jnp.stack(
-        [
-            strokes.aim_x.draw(next(keys), shape, strokes.steadiness, WIDE),
-            strokes.aim_y.draw(next(keys), shape, strokes.steadiness, WIDE),
-            jnp.full(shape, c.BALL_RADIUS),
-        ]
-    )
-    wanted = strokes.speed.draw(next(keys), shape, strokes.steadiness, WIDE) + strokes.counter * (speed - 3.5)
+    def draw(spread: Spread) -> Array:
+        return spread.draw(next(keys), shape, strokes.steadiness, WIDE)
+
+    target = jnp.stack([draw(strokes.aim_x), draw(strokes.aim_y), jnp.full(shape, c.BALL_RADIUS)])
+    wanted = draw(strokes.speed) + strokes.counter * (speed - 3.5)
     wanted = wanted + strokes.attack * jnp.maximum(ball.position[2] - COMFORTABLE_HEIGHT, 0.0)
     wanted = jnp.clip(wanted, strokes.speed.low, strokes.speed.high)
-    clearance = strokes.clearance.draw(next(keys), shape, strokes.steadiness, WIDE)
-    seconds = estimate_stroke_seconds(ball.position, target, wanted, clearance)
+    seconds = estimate_stroke_seconds(ball.position, target, wanted, draw(strokes.clearance))
     seconds = jnp.minimum(seconds, estimate_fall_seconds(strokes.climb, ball.position[2]))
     spin = _spin(player.spin, next(keys), target - ball.position)
     velocity = aim_stroke(flight, ball.position, target, seconds, spin)
@@ -298,13 +291,8 @@ def difficulty(player: Player, state: PlayerState, incoming: Incoming) -> Float[
     met = (incoming.landing[0], incoming.landing[1], speed)
     away = sum(((m - e) / unit) ** 2 for m, e, unit in zip(met, state.expected, SURPRISE, strict=True))
     strange = 1.0 - 0.7 * state.familiarity
-    return (
-        stretch(ability, incoming)
-        + lean
-        + height
-        + fast
-        + strange * (spin + player.person.strangeness * jnp.sqrt(away))
-    )
+    surprise = strange * (spin + player.person.strangeness * jnp.sqrt(away))
+    return stretch(ability, incoming) + lean + height + fast + surprise
 
 
 def stretch(ability: Ability, incoming: Incoming) -> Float[Array, "*batch"]:
