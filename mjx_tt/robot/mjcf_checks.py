@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -13,6 +14,9 @@ from mjx_tt.robot.checks import altered_forces, unsupported
 from mjx_tt.robot.mjcf import PADDLE_SITE, capsules
 from mjx_tt.sim.actuators import EFFECTS
 from robot_io.robot_file import RobotFile
+
+if TYPE_CHECKING:
+    from mjx_tt.robot.robots import Robot
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -37,26 +41,12 @@ def needs_files(mjcf: str) -> bool:
     return _NEEDED_FILES.search(mjcf) is not None
 
 
-def find_mistakes(
-    file: RobotFile,
-    own_spec: Callable[[], mujoco.MjSpec],
-    at_table: Callable[[], mujoco.MjModel],
-    where: str,
-    yaml: str,
-) -> Iterator[str]:
-    """One line for every mistake of a robot.
-
-    Args:
-        file: its YAML.
-        own_spec: gives the MJCF as its author wrote it.
-        at_table: compiles the robot at the table.
-        where: names the MJCF in messages.
-        yaml: names the YAML.
-    """
+def find_mistakes(robot: Robot, where: str, yaml: str) -> Iterator[str]:
+    """One line for every mistake of a robot. where, yaml: names of its MJCF and its YAML in messages."""
+    file = robot.file
     yield from _drives(file, yaml)
     try:
-        own = own_spec()
-        alone = own.compile()
+        alone = robot.own_spec().compile()
     except ValueError as error:
         yield f"{where}: MuJoCo cannot compile it: {_one_line(error)}"
         return
@@ -68,7 +58,7 @@ def find_mistakes(
     ]
     yield from found
     try:
-        model = at_table()
+        model = robot.model()
     except ValueError as error:
         yield f"{where}: cannot stand at the table: {_one_line(error)}; rename it, the scene has one of that name"
         return

@@ -170,7 +170,7 @@ def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
         raise ValueError(f"{where}: {path} is missing or was changed since; put the MJCF and its files back there")
     robot = Robot(parsed, parsed.mjcf, path)
     origin = mjcf or path or f"{where}: mjcf"
-    mistakes = list(mjcf_checks.find_mistakes(parsed, robot.own_spec, robot.model, origin, where))
+    mistakes = list(mjcf_checks.find_mistakes(robot, origin, where))
     if mistakes:
         raise ValueError("\n".join(mistakes))
     return robot
