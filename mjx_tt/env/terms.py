@@ -28,6 +28,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
+from mjx_tt.env.network import check_name
 from mjx_tt.pytrees import pytree
 from robot_io.contract import JointLimits
 
@@ -103,7 +104,7 @@ class RewardTerm:
     weight: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_name("reward term", self.name)
+        check_name("reward term", self.name, "calm_wrist")
         for what, given, allowed in (("per", self.per, ("step", "ball")), ("reduce", self.reduce, tuple(REDUCTIONS))):
             if given not in allowed:
                 raise ValueError(f"reward term {self.name!r}: {what} is {given!r}, allowed: {', '.join(allowed)}")
@@ -121,7 +122,7 @@ class ObservationTerm:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_name("observation term", self.name)
+        check_name("observation term", self.name, "last_command")
 
     def __call__(self, sensed: Sensed) -> Array:
         rows = jnp.asarray(self.function(sensed))
@@ -138,8 +139,3 @@ def reward_term(
 def observation_term(name: str = "") -> Callable[[Callable[[Sensed], Any]], ObservationTerm]:
     """Makes a function an observation term, by default of its own name; an experiment asks for it: ``{NAME: 1.0}``."""
     return lambda function: ObservationTerm(name or function.__name__, function)
-
-
-def _check_name(what: str, name: Any) -> None:
-    if not (isinstance(name, str) and name.isidentifier()):
-        raise ValueError(f"{what} {name!r}: the name must be letters, digits and underscores, such as calm_wrist")

@@ -100,7 +100,7 @@ def load(path: str | Path) -> Robot:
     file cannot be read.
     """
     data, file, mjcf = _read(path)
-    return from_content(data, str(file), mjcf and str(mjcf))
+    return from_content(data, str(file), mjcf)
 
 
 def paper() -> Robot:
@@ -142,8 +142,8 @@ def content(path: str | Path) -> dict[str, Any]:
     return _read(path)[0]
 
 
-def _read(path: str | Path) -> tuple[dict[str, Any], Path, Path | None]:
-    """The content, the YAML, and the MJCF where that is a file of its own."""
+def _read(path: str | Path) -> tuple[dict[str, Any], Path, str | None]:
+    """The content, the YAML, and the path of the MJCF where that is a file of its own."""
     file = yaml_path(path)
     data = yaml.read(file)
     if not isinstance(data, dict) or not isinstance(data.get("mjcf"), str) or "<" in data["mjcf"]:
@@ -154,7 +154,7 @@ def _read(path: str | Path) -> tuple[dict[str, Any], Path, Path | None]:
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: mjcf: {data['mjcf']} cannot be read: {error}; allowed: an MJCF's file") from None
     beside = {ELSEWHERE: str(mjcf.resolve())} if mjcf_checks.needs_files(text) else {}
-    return data | {"mjcf": text} | beside, file, mjcf
+    return data | {"mjcf": text} | beside, file, str(mjcf)
 
 
 def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
