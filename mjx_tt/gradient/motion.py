@@ -105,6 +105,7 @@ def simulate_motion(
             input_,
         )
 
+    seen = jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: ball.seen.shape[1]]
     depth = [latency.count_slots(x, period) for x in (config.max_action_latency, config.max_observation_latency)]
     carry = (
         (home, zero, actuators.rest(constants.drives, home)),
@@ -112,14 +113,10 @@ def simulate_motion(
         home,
         jnp.zeros((depth[0], *home.shape), dtype),
         jnp.broadcast_to(home, (depth[1], *home.shape)),
-        controller.start(observe(0, _first(episodes, ball), home, zero)),
+        controller.start(observe(0, seen, home, zero)),
     )
     _, (joints, velocities, commands, inputs) = jax.lax.scan(step, carry, (jnp.arange(ball.seen.shape[0]), ball.seen))
     return Motion(_with_start(home, joints), _with_start(zero, velocities), commands, inputs)
-
-
-def _first(episodes: Episodes, ball: Incoming) -> Array:
-    return jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: ball.seen.shape[1]]
 
 
 def _with_start(first: Array, by_tick: Array) -> Array:

@@ -22,7 +22,6 @@ from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_flights, heading, o
 from mjx_tt.diagnosis.ball.flights.forward_model import Flown, grid, leaves
 from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, SPIN, START_STEPS, BallProblem, Situation
-from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.sim.model import SimModel
 
@@ -94,7 +93,8 @@ def fit_states(tracks: Sequence[Trajectory], belief: Belief) -> Fitted:
     scaled = np.linalg.inv(information * size[:, :, None] * size[:, None])
     covariance[np.ix_(range(g.n), active, active)] = scaled * size[:, :, None] * size[:, None]
     seen = g.time[g.last, np.arange(g.n)]
-    return Fitted(start, covariance, problem.axes, _deviation(own), seen, belief)
+    deviation = float(np.sqrt(np.mean(np.median(own.scale, axis=1) ** 2)))
+    return Fitted(start, covariance, problem.axes, deviation, seen, belief)
 
 
 def fly_on(fitted: Fitted, time: Float[np.ndarray, "T n"]) -> tuple[Flown, Float[np.ndarray, "n T 3 3"]]:
@@ -214,10 +214,6 @@ def first_part(t: Trajectory, seconds: float) -> Trajectory:
     """The track's first seconds, LEAST samples at least."""
     stop = int(np.searchsorted(t.time, t.time[0] + seconds + 1e-9, side="right"))
     return t.part(0, max(stop, min(LEAST, len(t))))
-
-
-def _deviation(own: Noise) -> float:
-    return float(np.sqrt(np.mean(np.median(own.scale, axis=1) ** 2)))
 
 
 def lift_known(model: SimModel) -> bool:
