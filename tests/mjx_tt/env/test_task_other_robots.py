@@ -26,14 +26,6 @@ OTHERS = [name for name in robots.names() if name != robots.DEFAULT]
 TICKS = 60
 
 
-def a_policy(robot, seed=0):
-    joints = robot.contract.n_joints
-    theta = np.asarray(initial_theta(jax.random.key(seed), 0.3, contract.n_parameters(joints)))
-    rng = np.random.default_rng(seed)
-    mean = np.concatenate([[0.3, -0.5, 0.3], robot.home]).astype(np.float32)
-    return Policy(theta, mean, rng.uniform(1.0, 3.0, 3 + joints).astype(np.float32))
-
-
 @pytest.fixture(scope="module", params=OTHERS)
 def played(request):
     """A robot, a policy, and what it saw and did in four episodes: (TICKS, 3 + n, 4), (TICKS, n, 4)."""
@@ -41,7 +33,10 @@ def played(request):
     simulator = Simulator(TaskConfig(robot=robot))
     model = SimModel(joints=robot.contract.joints)
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 64)
-    policy = a_policy(robot)
+    joints, rng = robot.contract.n_joints, np.random.default_rng(0)
+    theta = np.asarray(initial_theta(jax.random.key(0), 0.3, contract.n_parameters(joints)))
+    mean = np.concatenate([[0.3, -0.5, 0.3], robot.home]).astype(np.float32)
+    policy = Policy(theta, mean, rng.uniform(1.0, 3.0, 3 + joints).astype(np.float32))
 
     @jax.jit
     def play(policy, pool):
