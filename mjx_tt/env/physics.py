@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ from mjx_tt.sim.actuators import DriveState
 from mjx_tt.sim.sensors import Filters
 
 if TYPE_CHECKING:
-    from mjx_tt.env.task import TaskConfig
     from mjx_tt.robot.dynamics_mjx import MjxEngine
 
 ENGINES = ("fused", "mjx")
@@ -35,10 +34,11 @@ OUT_OF_REACH = (-2.9, -0.6)  # [m] y and z of an incoming ball below which nobod
 class Physics:
     """Motion of robot and ball between two control steps, and the measurements of it.
 
+    config: a ``task.TaskConfig``
     engine: its ``step(qpos, qvel, ctrl)`` gives joint positions and velocities (n, ...) one substep later
     """
 
-    def __init__(self, config: TaskConfig) -> None:
+    def __init__(self, config: Any) -> None:
         robot, self.config = config.robot, config
         self.contract, self.home = robot.contract, robot.home
         self.substeps, self.period, self.timestep = config.substeps, config.period, 1.0 / config.sim_rate

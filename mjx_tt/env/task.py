@@ -267,6 +267,8 @@ class TaskConfig:
 class Task(Physics):
     """Episodes of one robot under one configuration."""
 
+    config: TaskConfig
+
     def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
         """Robot at rest at home (or ``episodes.start``), ball at its launch; history buffers hold these values."""
         batch, dtype, config = episodes.ball.position.shape[1:], episodes.ball.position.dtype, self.config

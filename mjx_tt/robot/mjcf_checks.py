@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,9 +14,6 @@ from mjx_tt.robot.checks import altered_forces, unsupported
 from mjx_tt.robot.mjcf import PADDLE_SITE, capsules
 from mjx_tt.sim.actuators import EFFECTS
 from robot_io.robot_file import RobotFile
-
-if TYPE_CHECKING:
-    from mjx_tt.robot.robots import Robot
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -41,8 +38,8 @@ def needs_files(mjcf: str) -> bool:
     return _NEEDED_FILES.search(mjcf) is not None
 
 
-def find_mistakes(robot: Robot, where: str, yaml: str) -> Iterator[str]:
-    """One line for every mistake of a robot. where, yaml: names of its MJCF and its YAML in messages."""
+def find_mistakes(robot: Any, where: str, yaml: str) -> Iterator[str]:
+    """One line for every mistake of a ``robots.Robot``. where, yaml: names of its MJCF and its YAML in messages."""
     file = robot.file
     yield from _drives(file, yaml)
     try:
