@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from dataclasses import dataclass
 from typing import TypeVar
 
 import jax
@@ -28,6 +27,7 @@ from mjx_tt.env.episode import Episodes, EpisodeState, FixedAction, Return, resh
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import add_weighted, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import HISTORY, N_OBSERVATION
@@ -42,8 +42,7 @@ OBSERVATION_SIZE = HISTORY * N_OBSERVATION  # of the paper's robot
 FEWEST_FLOWN = 16  # balls flown out together, at least
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EnvState:
     """State of an environment between steps; batch axes last."""
 
@@ -161,9 +160,7 @@ class TableTennis(Env):
             back = jax.tree.map(lambda x, new: x.at[..., index].set(new, mode="drop"), back, part)
             return left.at[index].set(False, mode="drop"), back
 
-        zero = jnp.zeros_like(ball.position[0])
-        back = Return(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))
-        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, back))[1]
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, Return.nowhere(ball)))[1]
 
 
 def flatten(history: Float[Array, "8 observed *batch"]) -> Float[Array, "*batch size"]:

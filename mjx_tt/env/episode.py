@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, UInt32
 
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState
-from mjx_tt.sim.actuators import Drives, DriveState
+from mjx_tt.pytrees import pytree
+from mjx_tt.sim.actuators import DriveState, JointDrive
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.sensors import Camera, Filters
@@ -41,8 +42,7 @@ class Controller(Protocol):
         ...
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class FixedAction:
     """A controller with an action decided outside."""
 
@@ -56,8 +56,7 @@ class FixedAction:
         return self.action, ()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Episodes:
     """The random part of a batch of episodes."""
 
@@ -74,20 +73,18 @@ def reshape_episodes(episodes: Episodes, *batch: int) -> Episodes:
     return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, episodes)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EpisodeConstants:
     """Delays, drives and camera of the episodes, computed once before the loop."""
 
     ball: Delay
     joints: Delay  # (8, ...)
     action: Delay  # (8, ...)
-    drives: Drives
+    drives: JointDrive  # (8, ...) of each effect, as ``actuators.sort_by_effect`` gives them
     camera: Camera | None
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Accumulators:
     """Running quantities of phase 1."""
 
@@ -99,8 +96,7 @@ class Accumulators:
     terms: dict[str, Float[Array, "*batch"]]  # of the reward terms per control step, sums over the steps
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EpisodeState:
     """State of phase 1 between control steps."""
 
@@ -124,8 +120,7 @@ class EpisodeState:
     accumulators: Accumulators
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Return:
     """Outcome of phase 2."""
 
@@ -133,3 +128,9 @@ class Return:
     net_height: Float[Array, "*batch"]  # [m] of the ball's centre there
     returned: Bool[Array, "*batch"]
     landing: Float[Array, "2 *batch"]  # [m] where it came down to the table's height
+
+    @classmethod
+    def nowhere(cls, ball: BallState) -> Return:
+        """Of balls that have not flown yet."""
+        zero = jnp.zeros_like(ball.position[0])
+        return cls(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))

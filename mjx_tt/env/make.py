@@ -14,7 +14,6 @@ from ballmodel.distribution import BallDistribution, BallMixture
 from ballmodel.sampling import sample_pool
 from mjx_tt.env import user_defined
 from mjx_tt.env.brax import TableTennis, register_environment
-from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
@@ -25,7 +24,7 @@ from robot_io.policy import artefact
 
 Balls = BallDistribution | BallMixture | str | os.PathLike
 Model = SimModel | ModelFile | str | os.PathLike | None
-OUTCOMES = {MISSED: "missed", HIT: "hit", RETURNED: "returned"}
+OUTCOMES = np.array(["missed", "hit", "returned"])  # in the order of MISSED, HIT, RETURNED
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class Rollout:
         return PlayedEpisodes(
             terms=dict(zip(self.simulator.config.terms, result.terms, strict=True)),
             returns=np.asarray(result.returns),
-            outcome=np.array([OUTCOMES[i] for i in sorted(OUTCOMES)])[result.outcome],
+            outcome=OUTCOMES[result.outcome],
             landing=np.asarray(result.landing).T,
             incoming=np.asarray(balls.landing).T[order],
             ball=start.T[order],

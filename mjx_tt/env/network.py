@@ -34,8 +34,7 @@ class Network:
     source: str = ""
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.name, str) and self.name.isidentifier()):
-            raise ValueError(f"network {self.name!r}: the name must be letters, digits and underscores, such as gru")
+        check_name("network", self.name, "gru")
 
     @property
     def size(self) -> int:
@@ -44,6 +43,12 @@ class Network:
     def unflatten(self, theta: Any) -> dict[str, Any]:
         """Parameters by name from theta (size, ...)."""
         return unflatten(theta, self.shapes)
+
+
+def check_name(what: str, name: Any, example: str) -> None:
+    """Raises ValueError for a name that is no identifier."""
+    if not (isinstance(name, str) and name.isidentifier()):
+        raise ValueError(f"{what} {name!r}: the name must be letters, digits and underscores, such as {example}")
 
 
 def network(name: str, shapes: Mapping[str, tuple[int, ...]]) -> Callable[[type], Network]:

@@ -1,10 +1,9 @@
-"""Robot and incoming ball through the substeps of a control period."""
+"""Robot and incoming ball through the substeps of a control period, and what the delayed sensors see of them."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,72 +14,67 @@ from ballmodel import flight
 from ballmodel.flight import Events
 from ballmodel.state import BallState, where
 from ballmodel.vec import norm, row
-from mjx_tt.env import observation
 from mjx_tt.env.episode import EpisodeConstants, Episodes, EpisodeState, Tick
-from mjx_tt.robot.chain import chain_from_model
+from mjx_tt.env.terms import Sensed
 from mjx_tt.robot.clearance import CapsuleClearance
 from mjx_tt.robot.dynamics_fused import FusedEngine
 from mjx_tt.robot.kinematics import Joints, PaddleKinematics
-from mjx_tt.robot.mjcf import capsules, paddle_frame
-from mjx_tt.robot.robots import Robot
 from mjx_tt.robot.scalar_algebra import optimization_barrier
-from mjx_tt.sim import actuators, latency, sensors
+from mjx_tt.sim import actuators, latency, noise, sensors
 from mjx_tt.sim.actuators import DriveState
 from mjx_tt.sim.sensors import Filters
 
+if TYPE_CHECKING:
+    from mjx_tt.robot.dynamics_mjx import MjxEngine
+
 ENGINES = ("fused", "mjx")
+OUT_OF_REACH = (-2.9, -0.6)  # [m] y and z of an incoming ball below which nobody can play it
 
 
-class Engine(Protocol):
-    """Dynamics of the robot alone."""
+class Physics:
+    """Motion of robot and ball between two control steps, and the measurements of it.
 
-    @property
-    def name(self) -> str: ...
+    config: a ``task.TaskConfig``
+    engine: its ``step(qpos, qvel, ctrl)`` gives joint positions and velocities (n, ...) one substep later
+    """
 
-    def step(self, qpos: Joints, qvel: Joints, ctrl: Joints) -> tuple[Joints, Joints]:
-        """Joint positions and velocities (n, ...) one substep later."""
-        ...
-
-
-class Physics(ABC):
-    """Motion of robot and ball between two control steps; the task says when a ball is over."""
-
-    def __init__(
-        self, robot: Robot, engine: str, control_rate: float, sim_rate: float, longest: tuple[float, float]
-    ) -> None:
-        """longest: latencies of observation and action [s] for which there is memory."""
+    def __init__(self, config: Any) -> None:
+        robot, self.config = config.robot, config
         self.contract, self.home = robot.contract, robot.home
-        self.substeps, self.period, self.timestep = round(sim_rate / control_rate), 1.0 / control_rate, 1.0 / sim_rate
-        self._longest = longest
-        model = robot.model()
-        chain = chain_from_model(model)
-        self.engine: Engine
-        if engine == "mjx":
+        self.substeps, self.period, self.timestep = config.substeps, config.period, 1.0 / config.sim_rate
+        self.engine: FusedEngine | MjxEngine
+        if config.engine == "mjx":
             from mjx_tt.robot.dynamics_mjx import MjxEngine  # MJX takes seconds to import
 
-            self.engine = MjxEngine(model, self.timestep)
+            self.engine = MjxEngine(robot.model(), self.timestep)
         else:
-            self.engine = FusedEngine(chain, self.timestep)
-        self.kinematics = PaddleKinematics(chain, paddle_frame(model))
-        self.clearance = CapsuleClearance(self.kinematics, capsules(model), robot.file)
+            self.engine = FusedEngine(robot.chain(), self.timestep)
+        self.kinematics = PaddleKinematics(robot.chain(), robot.paddle())
+        self.clearance = CapsuleClearance(self.kinematics, robot.capsules(), robot.file)
 
-    @abstractmethod
     def is_over(self, ball: BallState, events: Events, bounced: Bool[Array, "*batch"]) -> Bool[Array, "*batch"]:
-        """True where what happened in a substep decided the ball. bounced: on the robot's side, before it."""
+        """Termination: the ball is touched, in the net, down a second time or on the wrong side, or out of reach.
+
+        bounced: on the robot's side, before the substep of the events.
+        """
+        own_side = events.table & (events.position[1] < 0.0)
+        over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
+        y_min, z_min = OUT_OF_REACH
+        return over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
 
     def prepare(self, episodes: Episodes) -> EpisodeConstants:
         """Splits the episodes' latencies, with what clock and drives add to them, and sorts drives and camera."""
-        model, seconds, (longest_observation, longest_action) = episodes.model, episodes.latency, self._longest
+        model, seconds, config = episodes.model, episodes.latency, self.config
         batch, axes, n = seconds.shape[1:], self.contract.carrying, self.contract.n_joints
         joints = jnp.stack([seconds[2 if i in axes else 1] for i in range(n)])
         actions = jnp.stack([seconds[4 if i in axes else 3] for i in range(n)])
         ball, drives = seconds[0], actuators.sort_by_effect(model.drives, batch, seconds.dtype, self.contract.joints)
         if model.sensing.clock_rate is not None:
-            ball = jnp.clip(ball * model.sensing.clock_rate, 0.0, longest_observation)
+            ball = jnp.clip(ball * model.sensing.clock_rate, 0.0, config.max_observation_latency)
         if drives.observation_delay is not None:
-            joints = jnp.clip(joints + drives.observation_delay, 0.0, longest_observation)
+            joints = jnp.clip(joints + drives.observation_delay, 0.0, config.max_observation_latency)
         if drives.action_delay is not None:
-            actions = jnp.clip(actions + drives.action_delay, 0.0, longest_action)
+            actions = jnp.clip(actions + drives.action_delay, 0.0, config.max_action_latency)
         return EpisodeConstants(
             latency.split_observation_delay(ball, self.period),
             latency.split_observation_delay(joints, self.period),
@@ -100,9 +94,6 @@ class Physics(ABC):
         params, tracker, timestep = episodes.model.ball, episodes.model.sensing, self.timestep
         old, new = (actuators.limit_command(constants.drives, command) for command in commands)
 
-        def capture(i: Tick, ball: BallState, filters: Filters, joints: Array) -> Array:
-            return observation.capture(episodes, constants, self.substeps, timestep, i, ball, filters, joints)
-
         def substep(i: Tick, carry: tuple) -> tuple:
             (qpos, qvel, pose, drive, filters, ball, (bounced, hit, live), closest), captured = carry
             robot, carried, (bent, bent_velocity) = self.step_robot(
@@ -121,14 +112,15 @@ class Physics(ABC):
             distance = norm(ball.position - after.position)
             closest = jnp.where(live & bounced, jnp.minimum(closest, distance), closest)
             live = live & ~over
-            captured = captured + capture(i + 1, ball, filters, carried)
+            captured = captured + self.capture(episodes, constants, i + 1, ball, filters, carried)
             return optimization_barrier(
                 ((qpos, qvel, after, drive, filters, ball, (bounced, hit, live), closest), captured)
             )
 
         closest = s.accumulators.closest
         start = (s.qpos, s.qvel, s.pose, s.drive, s.filters, s.ball, (s.bounced, s.hit, s.live), closest)
-        captured = capture(0, s.ball, s.filters, s.qpos if s.drive.output is None else s.drive.output)
+        carried = s.qpos if s.drive.output is None else s.drive.output
+        captured = self.capture(episodes, constants, 0, s.ball, s.filters, carried)
         return jax.lax.fori_loop(0, self.substeps, substep, (start, captured))
 
     def step_robot(
@@ -166,3 +158,56 @@ class Physics(ABC):
         if drive.swing is not None:
             bent, bent_velocity = carried + drive.swing[0], carried_velocity + drive.swing[1]
         return (qpos, qvel, drive), carried, (bent, bent_velocity)
+
+    def capture(
+        self,
+        episodes: Episodes,
+        constants: EpisodeConstants,
+        i: Tick,
+        ball: BallState,
+        filters: Filters,
+        joints: Joints,
+    ) -> Float[Array, "captured *batch"]:
+        """Share of the state at substep boundary ``i`` in the quantities that the delayed sensors see."""
+        seen_at = latency.weigh_capture(constants.ball, i, self.timestep)[None]
+        parts = [
+            seen_at * filters.see(ball.position),
+            latency.weigh_capture(constants.joints, i, self.timestep) * joints,
+        ]
+        if episodes.model.sensing.jitter is not None:
+            parts.append(seen_at * ball.velocity)
+        return jnp.concatenate(parts)
+
+    def sense(self, tick: Tick, s: EpisodeState, episodes: Episodes, constants: EpisodeConstants) -> Sensed:
+        """Measurements that arrive at control step ``tick``."""
+        joints = slice(3, 3 + self.contract.n_joints)
+        captured = [
+            latency.read_ring(s.observations[:, :3], tick - constants.ball.periods),
+            latency.read_ring(s.observations[:, joints], tick - constants.joints.periods),
+        ]
+        if episodes.model.sensing.jitter is not None:
+            captured.append(latency.read_ring(s.observations[:, joints.stop :], tick - constants.ball.periods))
+        return self.measure(episodes, constants, jnp.concatenate(captured), s.command, tick)
+
+    def measure(
+        self,
+        episodes: Episodes,
+        constants: EpisodeConstants,
+        captured: Float[Array, "captured *batch"],
+        command: Joints,
+        tick: Tick,
+    ) -> Sensed:
+        """The measurements of true delayed quantities, as the ring keeps them. command: of the step before."""
+        n, tracker = self.contract.n_joints, episodes.model.sensing
+        ball, joints = captured[:3], captured[3 : 3 + n]
+        if tracker.jitter is not None:
+            late = tracker.jitter * noise.normal(episodes.seed, tick, 3).astype(ball.dtype)
+            ball = ball + late[None] * captured[3 + n :]
+        if constants.camera is not None:
+            ball = constants.camera.project(ball)
+        u = noise.symmetric_uniform(episodes.seed, tick, 3).astype(captured.dtype)
+        offset = (tracker.ball_offset_x, tracker.ball_offset_y, tracker.ball_offset_z)
+        ball = jnp.stack([ball[i] + tracker.ball_noise * u[i] + offset[i] for i in range(3)])
+        if constants.drives.joint_offset is not None:
+            joints = joints + constants.drives.joint_offset
+        return Sensed(ball, joints, command)

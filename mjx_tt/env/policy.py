@@ -11,7 +11,7 @@ differentiated.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -22,6 +22,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from mjx_tt.env.episode import Tick
 from mjx_tt.env.network import Network
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.contract import GATED, n_parameters
 from robot_io.policy.jax_policy import Policy as Policy
@@ -64,8 +65,7 @@ def activate(z: Array, i: int, axis: int = 0) -> Array:
     return jnp.tanh(signal) * jax.nn.sigmoid(opening)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PolicyController:
     """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser.
 
@@ -98,8 +98,7 @@ def normalised(x: Float[Array, "observed *batch"], mean: Array, inv_std: Array) 
     return (x - mean.reshape(column)) * inv_std.reshape(column)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class NetworkController:
     """A user's network as a ``task.Controller``: theta (size, P), its functions mapped over P and R repeats.
 

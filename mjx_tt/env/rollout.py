@@ -8,7 +8,7 @@ perturbation axis can be split over devices (jax.sharding): every device runs it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -27,6 +27,7 @@ from mjx_tt.env.episode import HIT, MISSED, RETURNED, Controller, Episodes
 from mjx_tt.env.policy import controller
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, add_weighted, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Drawing, Randomised
@@ -38,8 +39,7 @@ AXIS = "perturbation"
 CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RolloutResult:
     """Results of a batch of episodes."""
 
@@ -54,20 +54,8 @@ class RolloutResult:
     observation_counts: Int[Array, " P"]
 
 
-# Axes of each field. Where a result stays on the devices it is split along the last one, P.
-_RANKS: dict[str, Any] = {
-    "terms": 3,
-    "returns": 2,
-    "outcome": 2,
-    "landing": 3,
-    "finite": 2,
-    "steps": 2,
-    "peak_velocity": 3,
-    "observation_sums": 3,
-    "observation_counts": 1,
-}
-# The layout of such a result for jax.shard_map: the same pytree of PartitionSpecs.
-RESULT_SPECS = jax.tree.map(lambda rank: PartitionSpec(*[None] * (rank - 1), AXIS), RolloutResult(**_RANKS))
+# The layout of such a result for jax.shard_map, by the axes of each field: split along the last one, P.
+RESULT_SPECS = RolloutResult(*(PartitionSpec(*[None] * (rank - 1), AXIS) for rank in (3, 2, 2, 3, 2, 2, 3, 3, 1)))  # type: ignore[arg-type]
 
 
 class Simulator:
@@ -146,13 +134,16 @@ class Simulator:
     def local(self, tree: T) -> T:
         """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are
         shared."""
-        return jax.tree.map(lambda x: self._share(x) if x.ndim else x, tree)
 
-    def _share(self, x: Array) -> Array:
-        width = x.shape[-1] // self.devices
-        if width * self.devices != x.shape[-1]:
-            raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
-        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * width, width, axis=-1)
+        def share(x: Array) -> Array:
+            if not x.ndim:
+                return x
+            width, left = divmod(x.shape[-1], self.devices)
+            if left:
+                raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
+            return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * width, width, axis=-1)
+
+        return jax.tree.map(share, tree)
 
     def rollout(self, policy: Policy, episodes: Episodes) -> RolloutResult:
         """Runs P policies, theta (976, P) with one normaliser (11,), each on its column of episodes (R, P).
@@ -220,12 +211,12 @@ class Simulator:
 
 def held_here(tree: T) -> T:
     """The arrays as this process holds them, where each of several processes holds a copy; others as they are."""
-    return jax.tree.map(_held_here, tree)
 
+    def held(x: Any) -> Any:
+        spread = isinstance(x, jax.Array) and not x.is_fully_addressable
+        return x.addressable_shards[0].data if spread else x
 
-def _held_here(x: Any) -> Any:
-    spread = isinstance(x, jax.Array) and not x.is_fully_addressable
-    return x.addressable_shards[0].data if spread else x
+    return jax.tree.map(held, tree)
 
 
 def _put(x: Any, where: NamedSharding) -> Array:

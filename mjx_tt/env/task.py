@@ -11,18 +11,16 @@ Everything is a pure function over a batch of any shape, the batch axes last.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ballmodel.flight import Events
-from ballmodel.state import BallState
-from mjx_tt.env import observation
 from mjx_tt.env.episode import Accumulators, Controller, EpisodeConstants, Episodes, EpisodeState, Return, Tick
 from mjx_tt.env.physics import ENGINES, Physics
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
@@ -137,10 +135,7 @@ def joint_angle(step: ControlStep) -> Array:
     lower, upper = np.asarray(step.limits.lower), np.asarray(step.limits.upper)
     soft = SOFT_RANGE * (upper - lower)
     inside = [(q > lower[i] + soft[i]) & (q < upper[i] - soft[i]) for i, q in enumerate(step.joints)]
-    safe = inside[0]
-    for each in inside[1:]:
-        safe = safe & each
-    return safe
+    return functools.reduce(operator.and_, inside)
 
 
 @reward_term(reduce="minus_sum")
@@ -251,7 +246,7 @@ class TaskConfig:
     def reward_weights(self) -> tuple[float, ...]:
         return tuple(term.weight for term in self.rewards)
 
-    @cached_property
+    @functools.cached_property
     def n_observation(self) -> int:
         """Rows of the policy's input: 11 for the paper's robot without further terms."""
         return count_rows(self.observations, self.robot.contract)
@@ -266,25 +261,13 @@ class TaskConfig:
         return 1.0 / self.control_rate
 
 
-# ---- Termination, reset and the control step -------------------------------------------------------------------------
-
-OUT_OF_REACH = (-2.9, -0.6)  # [m] y and z of an incoming ball below which nobody can play it
+# ---- Reset and the control step --------------------------------------------------------------------------------------
 
 
 class Task(Physics):
     """Episodes of one robot under one configuration."""
 
-    def __init__(self, config: TaskConfig) -> None:
-        longest = config.max_observation_latency, config.max_action_latency
-        super().__init__(config.robot, config.engine, config.control_rate, config.sim_rate, longest)
-        self.config = config
-
-    def is_over(self, ball: BallState, events: Events, bounced: Bool[Array, "*batch"]) -> Bool[Array, "*batch"]:
-        """Termination: the ball is touched, in the net, down a second time or on the wrong side, or out of reach."""
-        own_side = events.table & (events.position[1] < 0.0)
-        over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
-        y_min, z_min = OUT_OF_REACH
-        return over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
+    config: TaskConfig
 
     def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
         """Robot at rest at home (or ``episodes.start``), ball at its launch; history buffers hold these values."""
@@ -301,7 +284,7 @@ class Task(Physics):
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
         constants, tracker = self.prepare(episodes), episodes.model.sensing
         captured = seen if tracker.jitter is None else jnp.concatenate([seen, episodes.ball.velocity])
-        sensed = observation.measure(episodes, constants, captured, zeros, 0)
+        sensed = self.measure(episodes, constants, captured, zeros, 0)
         depth = latency.count_slots(config.max_observation_latency, self.period)
         return EpisodeState(
             qpos=home,
@@ -349,7 +332,7 @@ class Task(Physics):
         self, tick: Tick, s: EpisodeState, episodes: Episodes, constants: EpisodeConstants
     ) -> Float[Array, "observed *batch"]:
         """The policy's input at control step ``tick``."""
-        sensed = observation.sense(tick, s, episodes, constants)
+        sensed = self.sense(tick, s, episodes, constants)
         return optimization_barrier(compose_observation(self.config.observations, sensed))
 
     def step(

@@ -22,13 +22,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
+from mjx_tt.env.network import check_name
+from mjx_tt.pytrees import pytree
 from robot_io.contract import JointLimits
 
 # One episode on the robot has plain numbers, a batch in simulation arrays (...).
@@ -36,8 +37,7 @@ Flag: TypeAlias = Bool[Array | np.ndarray, "*batch"] | np.bool_ | bool
 Number: TypeAlias = Float[Array | np.ndarray, "*batch"] | np.floating | float
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ControlStep:
     """One control period under the policy, as it is at its end. SI units, the batch last."""
 
@@ -58,8 +58,7 @@ class ControlStep:
     period: float = field(metadata={"static": True})  # [s] of control
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PlayedBall:
     """One ball once all is over. SI units, the batch last."""
 
@@ -74,8 +73,7 @@ class PlayedBall:
     fault: Flag = False  # the robot stopped itself; never in a single episode of the simulation
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Sensed:
     """Measurements that the policy may see at a control step. SI units, the batch last."""
 
@@ -106,7 +104,7 @@ class RewardTerm:
     weight: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_name("reward term", self.name)
+        check_name("reward term", self.name, "calm_wrist")
         for what, given, allowed in (("per", self.per, ("step", "ball")), ("reduce", self.reduce, tuple(REDUCTIONS))):
             if given not in allowed:
                 raise ValueError(f"reward term {self.name!r}: {what} is {given!r}, allowed: {', '.join(allowed)}")
@@ -124,7 +122,7 @@ class ObservationTerm:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_name("observation term", self.name)
+        check_name("observation term", self.name, "last_command")
 
     def __call__(self, sensed: Sensed) -> Array:
         rows = jnp.asarray(self.function(sensed))
@@ -141,8 +139,3 @@ def reward_term(
 def observation_term(name: str = "") -> Callable[[Callable[[Sensed], Any]], ObservationTerm]:
     """Makes a function an observation term, by default of its own name; an experiment asks for it: ``{NAME: 1.0}``."""
     return lambda function: ObservationTerm(name or function.__name__, function)
-
-
-def _check_name(what: str, name: Any) -> None:
-    if not (isinstance(name, str) and name.isidentifier()):
-        raise ValueError(f"{what} {name!r}: the name must be letters, digits and underscores, such as calm_wrist")

@@ -5,8 +5,6 @@ So its flights need no derivatives, and all of them are known before the robot m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -14,14 +12,13 @@ from jaxtyping import Bool, Float
 
 from ballmodel import flight
 from ballmodel.state import BallState, where
-from mjx_tt.env import observation
 from mjx_tt.env.episode import EpisodeConstants, Episodes
 from mjx_tt.env.task import Task
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.sensors import Filters
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Incoming:
     """Balls that nobody plays, at the S + 1 ends of S substeps; L episodes.
 
@@ -43,7 +40,7 @@ def fly_incoming(task: Task, episodes: Episodes, constants: EpisodeConstants, ti
     nothing = jnp.zeros((task.contract.n_joints, *episodes.seed.shape), episodes.ball.position.dtype)
 
     def captured(i: int, ball: BallState, filters: Filters) -> Array:
-        whole = observation.capture(episodes, constants, n, timestep, i, ball, filters, nothing)
+        whole = task.capture(episodes, constants, i, ball, filters, nothing)
         return jnp.concatenate([whole[:3], whole[3 + nothing.shape[0] :]])
 
     def substep(ball: BallState, bounced: Array, live: Array, filters: Filters) -> tuple:

@@ -7,25 +7,22 @@ is left out, that joints disturb each other and that the load changes a loop, is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from mjx_tt.env import observation
 from mjx_tt.env.episode import Controller, EpisodeConstants, Episodes
 from mjx_tt.env.task import Task, compose_observation
 from mjx_tt.gradient.incoming import Incoming
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.kinematics import Joints
 from mjx_tt.sim import actuators, latency
 from robot_io.limits import limit_velocity
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Motion:
     """The robot under a policy while nothing is hit, through T control periods of S substeps in all.
 
@@ -80,12 +77,10 @@ def simulate_motion(
 
     def observe(tick: Array | int, seen: Array, joints: Array, command: Array) -> Array:
         captured = jnp.concatenate([seen[:3], joints, seen[3:]])
-        return compose_observation(
-            config.observations, observation.measure(episodes, constants, captured, command, tick)
-        )
+        return compose_observation(config.observations, task.measure(episodes, constants, captured, command, tick))
 
     def capture(i: int, joints: Array) -> Array:
-        return latency.weigh_capture(constants.joints, i, n, timestep) * joints
+        return latency.weigh_capture(constants.joints, i, timestep) * joints
 
     def step(carry: tuple, now: tuple[Array, Array]) -> tuple[tuple, tuple]:
         robot, command, reference, commands, measured, policy = carry
@@ -110,6 +105,7 @@ def simulate_motion(
             input_,
         )
 
+    seen = jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: ball.seen.shape[1]]
     depth = [latency.count_slots(x, period) for x in (config.max_action_latency, config.max_observation_latency)]
     carry = (
         (home, zero, actuators.rest(constants.drives, home)),
@@ -117,14 +113,10 @@ def simulate_motion(
         home,
         jnp.zeros((depth[0], *home.shape), dtype),
         jnp.broadcast_to(home, (depth[1], *home.shape)),
-        controller.start(observe(0, _first(episodes, ball), home, zero)),
+        controller.start(observe(0, seen, home, zero)),
     )
     _, (joints, velocities, commands, inputs) = jax.lax.scan(step, carry, (jnp.arange(ball.seen.shape[0]), ball.seen))
     return Motion(_with_start(home, joints), _with_start(zero, velocities), commands, inputs)
-
-
-def _first(episodes: Episodes, ball: Incoming) -> Array:
-    return jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: ball.seen.shape[1]]
 
 
 def _with_start(first: Array, by_tick: Array) -> Array:

@@ -6,8 +6,6 @@ all episodes in every control step, one by one: twenty times the time forwards, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -15,12 +13,12 @@ from jaxtyping import Float
 
 from mjx_tt.env.episode import Controller, Tick
 from mjx_tt.env.policy import activate, controller, normalised
+from mjx_tt.pytrees import pytree
 from robot_io.contract import GATED
 from robot_io.policy.policy import Past, Policy, start, step
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Matrices:
     """The network of P policies as a controller; it does what ``policy.PolicyController`` does.
 

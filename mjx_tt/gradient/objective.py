@@ -10,8 +10,6 @@ back does them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -25,6 +23,7 @@ from mjx_tt.gradient.incoming import fly_incoming
 from mjx_tt.gradient.motion import Motion, Servos, simulate_motion
 from mjx_tt.gradient.network import differentiable
 from mjx_tt.gradient.strike import Landing, Meeting, Strike, find_landing, find_meeting, simulate_strike
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.kinematics import Joints
 from robot_io.policy.policy import Policy
 
@@ -45,8 +44,7 @@ FACING_MARGIN = 0.1  # of the normal's y component
 MARGIN = 0.03  # to table and robot, and below the blade's clearance, at which a moment begins to count
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Played:
     """Measures of episodes (L,): cost is to be small.
 

@@ -7,7 +7,7 @@ impact that it would have had at the blade's middle, so that it says how to hold
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,14 @@ from ballmodel.vec import components, dot, row, stack
 from mjx_tt.env.task import Task
 from mjx_tt.gradient.incoming import Incoming
 from mjx_tt.gradient.motion import Motion
+from mjx_tt.pytrees import pytree
 
 STEP, STEPS = 0.025, 48  # [s] of the returning ball's flight, and how many: 1.2 s
 NEVER = 1e3  # [m^2] squared distance of a ball that cannot be played
 SLOWEST = 1e-3  # [m], [m/s] below which a quotient is not taken
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Meeting:
     """The moments of hits, and the nearest ones of misses, in episodes (L,).
 
@@ -44,8 +44,7 @@ class Meeting:
     hit: Bool[Array, " L"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Strike:
     """Outcomes of these moments.
 
@@ -57,8 +56,7 @@ class Strike:
     ball: BallState
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Landing:
     """Places where balls come down to the table's height, without table and net.
 

@@ -13,44 +13,44 @@ Elements = Sequence[Element]
 Dtypes = Sequence[Any]
 
 _BOOL = np.dtype(bool)
-# LLVM's conditions for floats, signed and unsigned numbers. With NaN only "ne" is true.
-_COMPARISONS: dict[str, tuple[str, str, str, Callable]] = {
-    "eq": ("oeq", "eq", "eq", np.equal),
-    "ne": ("une", "ne", "ne", np.not_equal),
-    "lt": ("olt", "slt", "ult", np.less),
-    "le": ("ole", "sle", "ule", np.less_equal),
-    "gt": ("ogt", "sgt", "ugt", np.greater),
-    "ge": ("oge", "sge", "uge", np.greater_equal),
-}
-_SUMS: dict[str, tuple[str, str, Callable]] = {
-    "add": ("fadd", "add", np.add),
-    "add_any": ("fadd", "add", np.add),
-    "sub": ("fsub", "sub", np.subtract),
-    "mul": ("fmul", "mul", np.multiply),
-}
-_BITS: dict[str, tuple[str, Callable]] = {
-    "and": ("and", np.bitwise_and),
-    "or": ("or", np.bitwise_or),
-    "xor": ("xor", np.bitwise_xor),
-}
-_SHIFTS: dict[str, tuple[str, Callable]] = {
-    "shift_left": ("shl", np.left_shift),
-    "shift_right_arithmetic": ("ashr", np.right_shift),
-    "shift_right_logical": ("lshr", lambda x, y: np.right_shift(x.view(np.uint32), y.view(np.uint32)).view(x.dtype)),
-}
-_ROUNDINGS: dict[str, tuple[str, Callable]] = {
-    "sqrt": ("sqrt", np.sqrt),
-    "abs": ("fabs", np.abs),
-    "floor": ("floor", np.floor),
-    "ceil": ("ceil", np.ceil),
-    "round": ("roundeven", np.rint),
+# Instructions with two operands: what they do to NumPy scalars, and LLVM's names of them for floats, signed and
+# unsigned numbers. With NaN of the comparisons only "ne" is true.
+_PAIRS: dict[str, tuple[Callable, str, str, str]] = {
+    "eq": (np.equal, "fcmp oeq", "icmp eq", "icmp eq"),
+    "ne": (np.not_equal, "fcmp une", "icmp ne", "icmp ne"),
+    "lt": (np.less, "fcmp olt", "icmp slt", "icmp ult"),
+    "le": (np.less_equal, "fcmp ole", "icmp sle", "icmp ule"),
+    "gt": (np.greater, "fcmp ogt", "icmp sgt", "icmp ugt"),
+    "ge": (np.greater_equal, "fcmp oge", "icmp sge", "icmp uge"),
+    "add": (np.add, f"fadd {CONTRACT}", "add", "add"),
+    "add_any": (np.add, f"fadd {CONTRACT}", "add", "add"),
+    "sub": (np.subtract, f"fsub {CONTRACT}", "sub", "sub"),
+    "mul": (np.multiply, f"fmul {CONTRACT}", "mul", "mul"),
+    "div": (lambda x, y: x / y if is_float(x.dtype) else np.trunc(x / y), f"fdiv {CONTRACT}", "sdiv", "udiv"),
+    "rem": (np.fmod, "", "srem", "urem"),
+    "and": (np.bitwise_and, "", "and", "and"),
+    "or": (np.bitwise_or, "", "or", "or"),
+    "xor": (np.bitwise_xor, "", "xor", "xor"),
+    "shift_left": (np.left_shift, "", "shl", "shl"),
+    "shift_right_arithmetic": (np.right_shift, "", "ashr", "ashr"),
+    "shift_right_logical": (
+        lambda x, y: np.right_shift(x.view(np.uint32), y.view(np.uint32)).view(x.dtype), "", "lshr", "lshr"
+    ),
+}  # fmt: skip
+# Intrinsics of one float.
+_SINGLES: dict[str, tuple[Callable, str]] = {
+    "sqrt": (np.sqrt, "sqrt"),
+    "abs": (np.abs, "fabs"),
+    "floor": (np.floor, "floor"),
+    "ceil": (np.ceil, "ceil"),
+    "round": (np.rint, "roundeven"),
 }
 _TO_EVEN = 1  # jax.lax.RoundingMethod.TO_NEAREST_EVEN
 
 
 def known(name: str) -> bool:
     """True for a primitive of ``elementwise``."""
-    return any(name in table for table in (_COMPARISONS, _SUMS, _BITS, _SHIFTS, _ROUNDINGS, _OTHERS))
+    return any(name in table for table in (_PAIRS, _SINGLES, _OTHERS))
 
 
 def elementwise(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any, params: dict | None = None) -> Element:
@@ -58,53 +58,33 @@ def elementwise(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any, params:
 
     d: the operands' dtypes; params: the primitive's.
     """
-    if name in _COMPARISONS:
-        real, signed, unsigned, fold = _COMPARISONS[name]
-        code = f"fcmp {real}" if is_float(d[0]) else f"icmp {signed if is_signed(d[0]) else unsigned}"
-        return e.apply(code + " {t0} {0}, {1}", fold, a, d, _BOOL)
-    if name in _SUMS:
-        real, whole, fold = _SUMS[name]
-        return e.apply((f"{real} {CONTRACT}" if is_float(out) else whole) + " {t} {0}, {1}", fold, a, d, out)
-    if name in _BITS:
-        code, fold = _BITS[name]
-        return e.apply(code + " {t} {0}, {1}", fold, a, d, out)
-    if name in _SHIFTS:
-        return _shift(e, name, a, d, out)
-    if name in _ROUNDINGS and is_float(out):
+    real = is_float(d[0])
+    if name in _PAIRS:
+        fold, *codes = _PAIRS[name]
+        code = codes[0 if real else 1 if is_signed(d[0]) else 2]
+        if not code:
+            raise Unsupported(f"{name} of floats")
+        if not real:
+            _check_second(e, name, a[1], out)
+        return e.apply(code + " {t0} {0}, {1}", fold, a, d, out)
+    if name in _SINGLES and real:
         if name == "round" and int((params or {}).get("rounding_method", _TO_EVEN)) != _TO_EVEN:
             raise Unsupported("rounding halves away from zero")
-        code, fold = _ROUNDINGS[name]
+        fold, code = _SINGLES[name]
         return e.apply("call {t} @llvm." + code + ".{s}({t} {0})", fold, a, d, out)
     return _OTHERS[name](e, a, d, out, params or {})
 
 
-def _shift(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any) -> Element:
-    by = e.forced(a[1])
-    if by.kind is not Kind.CONSTANT or not 0 <= by.value < 32 or np.dtype(out).itemsize != 4:
-        raise Unsupported(f"{name} by anything but a constant below 32")
-    code, fold = _SHIFTS[name]
-    return e.apply(code + " {t} {0}, {1}", fold, a, d, out)
-
-
-def _divide(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
-    if is_float(out):
-        return e.apply(f"fdiv {CONTRACT}" + " {t} {0}, {1}", np.divide, a, d, out)
-    _safe_divisor(e, a[1])
-    return e.apply(("sdiv" if is_signed(out) else "udiv") + " {t} {0}, {1}", lambda x, y: np.trunc(x / y), a, d, out)
-
-
-def _remainder(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
-    if is_float(out):
-        raise Unsupported("the remainder of floats")
-    _safe_divisor(e, a[1])
-    return e.apply(("srem" if is_signed(out) else "urem") + " {t} {0}, {1}", np.fmod, a, d, out)
-
-
-def _safe_divisor(e: Emitter, divisor: Element) -> None:
-    """The processor stops at whole divisions by 0, and by -1 of the least number."""
-    divisor = e.forced(divisor)
-    if divisor.kind is not Kind.CONSTANT or divisor.value in (0, -1):
-        raise Unsupported("a whole division by anything but a constant")
+def _check_second(e: Emitter, name: str, second: Element, out: Any) -> None:
+    """The processor stops at whole divisions by 0, and by -1 of the least number; shifts are by less than the bits."""
+    if name in ("div", "rem"):
+        second = e.forced(second)
+        if second.kind is not Kind.CONSTANT or second.value in (0, -1):
+            raise Unsupported("a whole division by anything but a constant")
+    if name.startswith("shift"):
+        second = e.forced(second)
+        if second.kind is not Kind.CONSTANT or not 0 <= second.value < 32 or np.dtype(out).itemsize != 4:
+            raise Unsupported(f"{name} by anything but a constant below 32")
 
 
 def _extreme(least: bool) -> Callable:
@@ -191,7 +171,7 @@ def _power(e: Emitter, a: Elements, d: Dtypes, out: Any, params: dict) -> Elemen
             result = square if e.forced(result).kind is Kind.CONSTANT else _times(e, result, square, out)
         n >>= 1
         square = _times(e, square, square, out) if n else square
-    return result if int(params["y"]) >= 0 else _divide(e, [constant(1, out), result], [out, out], out, {})
+    return result if int(params["y"]) >= 0 else elementwise(e, "div", [constant(1, out), result], [out, out], out)
 
 
 def _times(e: Emitter, x: Element, y: Element, out: Any) -> Element:
@@ -230,8 +210,6 @@ def _absolute(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
 
 
 _OTHERS: dict[str, Callable[[Emitter, Elements, Dtypes, Any, dict], Element]] = {
-    "div": _divide,
-    "rem": _remainder,
     "min": _extreme(True),
     "max": _extreme(False),
     "select_n": _select_n,
@@ -245,8 +223,8 @@ _OTHERS: dict[str, Callable[[Emitter, Elements, Dtypes, Any, dict], Element]] = 
     "not": _not,
     "abs": _absolute,
     "square": lambda e, a, d, out, _: _times(e, a[0], a[0], out),
-    "rsqrt": lambda e, a, d, out, _: _divide(
-        e, [constant(1, out), elementwise(e, "sqrt", a, d, out)], [out, out], out, {}
+    "rsqrt": lambda e, a, d, out, _: elementwise(
+        e, "div", [constant(1, out), elementwise(e, "sqrt", a, d, out)], [out, out], out
     ),
     "copy": lambda e, a, d, out, _: a[0],
     "copy_p": lambda e, a, d, out, _: a[0],

@@ -6,14 +6,12 @@ reads stays in its array, where neighbouring threads read neighbouring numbers.
 
 from __future__ import annotations
 
-import numpy as np
 from jax.extend import core
 
-from mjx_tt.lanes.emitter import Element, Emitter, Kind
+from mjx_tt.lanes.emitter import Emitter
 from mjx_tt.lanes.frame import Operand
 from mjx_tt.lanes.memory import Slots
-from mjx_tt.lanes.programs import emit
-from mjx_tt.lanes.values import Value
+from mjx_tt.lanes.programs import emit_step
 
 # Few lanes: blocks of one warp, which spread over all multiprocessors, with all the registers there are. Many: fewer
 # registers, so that more warps hide one another's waits (benchmarks.accelerator on an H200: 36 ms in place of 44 for
@@ -62,8 +60,7 @@ def module(traced: core.ClosedJaxpr, operands: list[Operand], lanes: int, column
         own.value(o.form, o.begin) if o.kind == "state" else rows(o, f"%a{i}").value(o.form, 0)
         for i, o in enumerate(operands)
     ]
-    tick = Value(np.dtype(np.int32), (), [Element(Kind.SCALAR, "%tick")])
-    results = emit(e, traced.jaxpr, list(traced.consts), [tick, *values])
+    results = emit_step(e, traced, values)
     own.replace(values[: len(states)], results, forms, begins)
     advance, e.lines = e.lines, []
 

@@ -11,23 +11,23 @@ import ctypes
 import hashlib
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.extend import core
 from jaxtyping import Bool, Int
 
 from mjx_tt.lanes import cuda, kernel, machine
-from mjx_tt.lanes.emitter import Element, Emitter, Kind, Unsupported
+from mjx_tt.lanes.emitter import Emitter, Unsupported
 from mjx_tt.lanes.frame import Operand
 from mjx_tt.lanes.handler import handler
 from mjx_tt.lanes.memory import Slots
-from mjx_tt.lanes.programs import emit
-from mjx_tt.lanes.values import LANES, Form, Value
+from mjx_tt.lanes.programs import emit_step
+from mjx_tt.lanes.values import LANES, Form
 
 S = TypeVar("S")
 Step = Callable[[Int[Array, ""], S, Any, Any], S]
@@ -148,11 +148,10 @@ def _check(arrays: list[Array], kinds: list[str], n_state: int) -> None:
 
 def _operands(shapes: list, kinds: list[str]) -> tuple[list[Operand], dict[str, int]]:
     """The arrays of a call, and the number of slots in each place."""
-    operands = []
-    used = {"state": 0, "own": 0, "shared": 0}
+    operands, used = [], {"state": 0, "own": 0, "shared": 0}
     for shape, kind in zip(shapes, kinds, strict=True):
         operand = Operand(kind, Form.of(shape), 0)
-        operands.append(Operand(kind, operand.form, used[operand.place]))
+        operands.append(replace(operand, begin=used[operand.place]))
         used[operand.place] += operand.form.size
     return operands, used
 
@@ -162,21 +161,12 @@ def _module(traced: core.ClosedJaxpr, operands: list[Operand], used: dict[str, i
     e = Emitter(machine.width())
     memory = {place: Slots(e, f"%{place}") for place in used}
     values = [memory[o.place].value(o.form, o.begin) for o in operands]
-    tick = Value(np.dtype(np.int32), (), [Element(Kind.SCALAR, "%tick")])
-    results = emit(e, traced.jaxpr, list(traced.consts), [tick, *values])
+    results = emit_step(e, traced, values)
     states = [o for o in operands if o.kind == "state"]
     n = len(states)
     memory["state"].replace(values[:n], results, [o.form for o in states], [o.begin for o in states])
-    step = "\n".join(
-        [
-            "define internal void @step(ptr noalias %state, ptr noalias %own, ptr noalias %shared, i32 %tick)",
-            "nounwind noinline {",
-            *e.entry,
-            *e.lines,
-            "ret void",
-            "}",
-        ]
-    )
+    head = "define internal void @step(ptr noalias %state, ptr noalias %own, ptr noalias %shared, i32 %tick)"
+    step = "\n".join([head, "nounwind noinline {", *e.entry, *e.lines, "ret void", "}"])
     return step + handler(operands, used, live, limit, e.width)
 
 

@@ -7,6 +7,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -47,13 +48,20 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
 
 def kept(text: str, built_for: str, suffix: str, folder: Path | None, build: Callable[[], bytes]) -> bytes:
     """The code that ``build`` makes of a text, from the folder if it was built for the same before."""
-    key = "|".join((text, built_for, str(llvm.llvm_version_info)))
-    path = folder / f"{_digest(key.encode())}{suffix}" if folder else None
-    code = _kept(path) if path else None
-    if code is None:
-        code = build()
-        if path:
-            _keep(path, code)
+    if folder is None:
+        return build()
+    path = folder / f"{_digest('|'.join((text, built_for, str(llvm.llvm_version_info))).encode())}{suffix}"
+    with suppress(OSError):
+        data = path.read_bytes()
+        # A file begins with the digest of what follows: LLVM would end the process over a damaged one.
+        if data[:64] == _digest(data[64:]).encode():
+            return data[64:]
+    code = build()
+    with suppress(OSError):  # a folder that cannot be written costs the next process some seconds, nothing else
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
+            file.write(_digest(code).encode() + code)
+        os.replace(file.name, path)  # whole or not at all
     return code
 
 
@@ -81,23 +89,3 @@ def optimised(text: str, target: llvm.TargetMachine | None = None) -> llvm.Modul
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def _kept(path: Path) -> bytes | None:
-    """A file begins with the digest of what follows: LLVM would end the process over a damaged one."""
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    return data[64:] if _digest(data[64:]).encode() == data[:64] else None
-
-
-def _keep(path: Path, code: bytes) -> None:
-    """Whole or not at all; a folder that cannot be written costs the next process some seconds, nothing else."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            file.write(_digest(code).encode() + code)
-        os.replace(file.name, path)
-    except OSError:
-        return

@@ -9,7 +9,7 @@ import numpy as np
 from jax.extend import core
 
 from mjx_tt.lanes.arithmetic import elementwise, known
-from mjx_tt.lanes.emitter import Emitter, Unsupported
+from mjx_tt.lanes.emitter import Element, Emitter, Kind, Unsupported
 from mjx_tt.lanes.functions import EXPANSIONS
 from mjx_tt.lanes.memory import Slots, begins_of
 from mjx_tt.lanes.values import LANES, RULES, Form, Value, of_constants, spread
@@ -33,6 +33,12 @@ def emit(e: Emitter, jaxpr: core.Jaxpr, constants: list[Any], arguments: list[Va
         results = _apply(e, equation, [read(atom) for atom in equation.invars])
         values |= zip(equation.outvars, results, strict=True)
     return [read(atom) for atom in jaxpr.outvars]
+
+
+def emit_step(e: Emitter, step: core.ClosedJaxpr, arguments: list[Value]) -> list[Value]:
+    """The results of a loop's step for its number %tick and these arguments. Raises Unsupported."""
+    tick = Value(np.dtype(np.int32), (), [Element(Kind.SCALAR, "%tick")])
+    return emit(e, step.jaxpr, list(step.consts), [tick, *arguments])
 
 
 def _apply(e: Emitter, equation: core.JaxprEqn, operands: list[Value]) -> list[Value]:

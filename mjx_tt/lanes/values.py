@@ -6,9 +6,11 @@ wherever it goes. What is moved along the lanes themselves is not supported.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, TypeAlias
 
 import jax
@@ -164,25 +166,23 @@ def _reduce(combine: str) -> Rule:
     def rule(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:
         axes = [forms[0].without(a) for a in params["axes"]]
         columns = np.moveaxis(operands[0].places, axes, range(len(axes))).reshape(-1, to.size).T
-        made = []
-        for column in columns:
-            total, *others = (operands[0].elements[i] for i in column)
-            for other in others:
-                total = elementwise(e, combine, [total, other], [to.dtype, to.dtype], to.dtype)
-            made.append(total)
-        return Value(to.dtype, to.shape, made)
+        chosen = ([operands[0].elements[i] for i in column] for column in columns)
+        return Value(to.dtype, to.shape, [_folded(e, combine, elements, to.dtype) for elements in chosen])
 
     return rule
 
 
+def _folded(e: Emitter, combine: str, elements: Sequence[Element], d: Any) -> Element:
+    return reduce(lambda total, other: elementwise(e, combine, [total, other], [d, d], d), elements)
+
+
 def _dot(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:
     """dot_general: batch axes first, then what is left of each operand."""
-    (contracted, batched) = params["dimension_numbers"]
+    contracted, batched = params["dimension_numbers"]
     tables = []
     for x, form, over, along in zip(operands, forms, contracted, batched, strict=True):
-        along = [a for a in along if a != form.axis]
+        along = [form.without(a) for a in along if a != form.axis]
         over = [form.without(a) for a in over]
-        along = [form.without(a) for a in along]
         rest = [a for a in range(len(x.shape)) if a not in (*over, *along)]
         table = x.places.transpose([*along, *rest, *over])
         sizes = [math.prod(x.shape[a] for a in group) for group in (along, rest, over)]
@@ -193,18 +193,12 @@ def _dot(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params:
     d, made = to.dtype, []
     if any(x.dtype != d for x in operands):
         raise Unsupported("a product of numbers of different types")
-    for b in range(left.shape[0]):
-        for row in left[b]:
-            for column in right[b]:
-                pairs = zip(row, column, strict=True)
-                terms = [
-                    elementwise(e, "mul", [operands[0].elements[i], operands[1].elements[j]], [d, d], d)
-                    for i, j in pairs
-                ]
-                total = terms[0]
-                for term in terms[1:]:
-                    total = elementwise(e, "add", [total, term], [d, d], d)
-                made.append(total)
+    one, other = (x.elements for x in operands)
+    for rows, columns in zip(left, right, strict=True):
+        for row, column in itertools.product(rows, columns):
+            pairs = zip(row, column, strict=True)
+            terms = [elementwise(e, "mul", [one[i], other[j]], [d, d], d) for i, j in pairs]
+            made.append(_folded(e, "add", terms, d))
     # Where only one operand has lanes, they come out behind what is left of the operands before: the same order.
     return Value(d, to.shape, made)
 

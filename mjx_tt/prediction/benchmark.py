@@ -74,7 +74,6 @@ def benchmark(
     tracks: Sequence[Trajectory],
     models: Mapping[str, SimModel] | None = None,
     horizons: Sequence[float] = HORIZONS,
-    seed: int = 0,
 ) -> Benchmark:
     """Scores of the baselines and of the models on one set of tracks in the table frame.
 
@@ -120,13 +119,11 @@ def benchmark(
                 if which.any():
                     inside = squares[method][h, which] < chi2.ppf(LEVEL, 3) if method in squares else np.nan
                     share = float(np.mean(inside))
-                    scores.append(_score(method, float(horizon), across, error[h][which], seed, share))
+                    scores.append(_score(method, float(horizon), across, error[h][which], share))
     return Benchmark(name, len(usable), record, tuple(scores), errors, squares, learnt)
 
 
-def landing_benchmark(
-    name: str, events: Events, models: Mapping[str, SimModel] | None = None, seed: int = 0
-) -> Benchmark:
+def landing_benchmark(name: str, events: Events, models: Mapping[str, SimModel] | None = None) -> Benchmark:
     """Errors of the first bounce's place from a shot's measured state, spin included.
 
     Nothing is fitted, so every shot counts; the horizon is that of the flight's median. Raises ValueError for fewer
@@ -157,7 +154,7 @@ def landing_benchmark(
         landed = fly(world, {}, start[:, None], g, axes)
         off = np.linalg.norm(landed.bounce[:2, 0] - position[:2, bounces], axis=0)
         errors[label] = np.minimum(np.where(np.isfinite(landed.bounce_time[0]), off, CAP), CAP)[None]
-    scores = tuple(_score(label, seconds, "all", error[0], seed) for label, error in errors.items())
+    scores = tuple(_score(label, seconds, "all", error[0]) for label, error in errors.items())
     return Benchmark(name, shots.size, Record((), shots.size, shots.size, ()), scores, errors, {}, "")
 
 
@@ -175,10 +172,8 @@ def _bounces(held: Sequence[Trajectory], times: Float[np.ndarray, "h n"]) -> Boo
     return out
 
 
-def _score(
-    method: str, horizon: float, across: str, errors: Float[np.ndarray, " n"], seed: int, inside: float = np.nan
-) -> Score:
-    rng = np.random.default_rng(seed)
+def _score(method: str, horizon: float, across: str, errors: Float[np.ndarray, " n"], inside: float = np.nan) -> Score:
+    rng = np.random.default_rng(0)
     drawn = errors[rng.integers(0, errors.size, (DRAWS, errors.size))]
 
     def interval(value: float, values: np.ndarray) -> tuple[float, float, float]:

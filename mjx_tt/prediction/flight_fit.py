@@ -22,7 +22,6 @@ from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_flights, heading, o
 from mjx_tt.diagnosis.ball.flights.forward_model import Flown, grid, leaves
 from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, SPIN, START_STEPS, BallProblem, Situation
-from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.sim.model import SimModel
 
@@ -94,7 +93,8 @@ def fit_states(tracks: Sequence[Trajectory], belief: Belief) -> Fitted:
     scaled = np.linalg.inv(information * size[:, :, None] * size[:, None])
     covariance[np.ix_(range(g.n), active, active)] = scaled * size[:, :, None] * size[:, None]
     seen = g.time[g.last, np.arange(g.n)]
-    return Fitted(start, covariance, problem.axes, _deviation(own), seen, belief)
+    deviation = float(np.sqrt(np.mean(np.median(own.scale, axis=1) ** 2)))
+    return Fitted(start, covariance, problem.axes, deviation, seen, belief)
 
 
 def fly_on(fitted: Fitted, time: Float[np.ndarray, "T n"]) -> tuple[Flown, Float[np.ndarray, "n T 3 3"]]:
@@ -110,6 +110,24 @@ def fly_on(fitted: Fitted, time: Float[np.ndarray, "T n"]) -> tuple[Flown, Float
         ahead, factor = fitted.belief.wider
         covariance *= np.interp(time - fitted.seen, ahead, factor).T[:, :, None, None]
     return flown, covariance
+
+
+def predict(
+    track: Trajectory, model: SimModel | Belief | None = None, horizon: float | Sequence[float] = 0.3
+) -> tuple[Float[np.ndarray, "3 h"], Float[np.ndarray, "3 3 h"]]:
+    """Places [m] of the ball ``horizon`` [s] after the track's last sample, and their covariances [m^2].
+
+    track: samples of one flight so far, in the table frame, bounces on the table included. model: the nominal one
+    without; a Belief, as ``learn`` makes it of other flights, holds spins, scatter of bounces, and calibrated regions
+    as well. The covariance is that of a sample measured there. Raises ValueError for fewer than four samples or a
+    horizon that is not ahead.
+    """
+    ahead = np.atleast_1d(np.asarray(horizon, np.float64))
+    if ahead.ndim != 1 or not np.all(np.isfinite(ahead)) or np.any(ahead <= 0.0) or np.any(np.diff(ahead) <= 0.0):
+        raise ValueError(f"horizon {ahead.tolist()}: increasing seconds above 0 are wanted")
+    belief = model if isinstance(model, Belief) else Belief.of(model or SimModel())
+    flown, covariance = fly_on(fit_states([track], belief), (track.time[-1] - track.time[0] + ahead)[:, None])
+    return flown.position[:, 1:, 0, 0], np.moveaxis(covariance[0], 0, 2)
 
 
 def learn(
@@ -196,10 +214,6 @@ def first_part(t: Trajectory, seconds: float) -> Trajectory:
     """The track's first seconds, LEAST samples at least."""
     stop = int(np.searchsorted(t.time, t.time[0] + seconds + 1e-9, side="right"))
     return t.part(0, max(stop, min(LEAST, len(t))))
-
-
-def _deviation(own: Noise) -> float:
-    return float(np.sqrt(np.mean(np.median(own.scale, axis=1) ** 2)))
 
 
 def lift_known(model: SimModel) -> bool:

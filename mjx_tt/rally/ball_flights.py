@@ -6,9 +6,7 @@ Batch axis last; (L,) unless noted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -19,8 +17,9 @@ from ballmodel import constants as c
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.return_flight import FLOOR
+from mjx_tt.env.return_flight import FLOOR, take_long_steps
 from mjx_tt.lanes.loop import while_any
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS, JointLimits
 
@@ -30,8 +29,7 @@ HOME_DELAY = 0.1  # [s] to brake after the hit (estimate)
 READY = 0.06  # [s] between the bounce and the earliest contact (estimate)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Sent:
     """Outcome of the players' balls if nobody plays them."""
 
@@ -41,19 +39,13 @@ class Sent:
     landing: Float[Array, "2 L"]  # [m] there
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Meeting:
     """The robot's returns as they come to the players."""
 
     incoming: Incoming
     reached: Bool[Array, " L"]  # could be hit before it bounced again or fell to the floor
     net: Bool[Array, " L"]  # touched it on the way
-
-
-def _take_long_steps(params: BallParams) -> BallParams:
-    """Alone in the air a ball needs no substeps if they are of second order."""
-    return replace(params, flight=replace(params.flight, integrator="midpoint"))
 
 
 def _count_ticks(period: float) -> int:
@@ -63,7 +55,7 @@ def _count_ticks(period: float) -> int:
 
 def fly_serve(params: BallParams, ball: BallState, period: float) -> Sent:
     """Flies balls (3, L) until they come down, in steps of ``period`` [s]."""
-    params, false = _take_long_steps(params), jnp.zeros(ball.position.shape[1:], bool)
+    params, false = take_long_steps(params), jnp.zeros(ball.position.shape[1:], bool)
     start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
 
     def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
@@ -95,7 +87,7 @@ def fly_to_player(
 
     returned: which balls to fly. The contact is looked for once per ``period`` [s].
     """
-    params, zero = _take_long_steps(params), jnp.zeros_like(ball.position[0])
+    params, zero = take_long_steps(params), jnp.zeros_like(ball.position[0])
     start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
 
     def step(tick: Array, state: tuple, by_lane: tuple, _: tuple) -> tuple:

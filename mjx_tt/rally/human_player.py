@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -33,6 +33,7 @@ from ballmodel.io.ranges import FINITE
 from ballmodel.io.validation import Finite, Increasing, find, validate
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, row
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally.shots import aim_stroke, estimate_fall_seconds, estimate_stroke_seconds, perturb_stroke
 
 Number: TypeAlias = Annotated[jax.Array | float, FINITE]  # a file has one number
@@ -51,8 +52,7 @@ LOB_SPIN = 0.3  # share of a stroke's spin that a lob has
 SPIN_UNIT = 100.0  # [rad/s] of incoming spin: one unit
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Spread:
     """A quantity that varies from ball to ball: half a normal distribution to each side of the usual value, cut off."""
 
@@ -79,8 +79,7 @@ class Spread:
         return self.usual + share * jnp.where(n > 0.0, self.high - self.usual, self.usual - self.low)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class FirstBalls:
     """First balls of a player. The way to the landing point and the speed ask for a climb; the bounds come
     after."""
@@ -97,8 +96,7 @@ class FirstBalls:
     mishit: Number  # share of balls with four times the errors
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Strokes:
     """Answers of a player to returns."""
 
@@ -114,8 +112,7 @@ class Strokes:
     attack: Number  # [1/s] speed added per height of the contact over COMFORTABLE_HEIGHT
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Ability:
     """Ability of a player. Errors are those of an easy ball, as standard deviations."""
 
@@ -132,8 +129,7 @@ class Ability:
     misread: Number  # [rad] error upwards per SPIN_UNIT of incoming topspin that the player is not used to
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Spin:
     """Spin that a player's strokes give [rad/s]."""
 
@@ -142,8 +138,7 @@ class Spin:
     side_spread: Number
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Person:
     """Changes of a player in the course of a session."""
 
@@ -154,8 +149,7 @@ class Person:
     strangeness: Number  # difficulty per unit of surprise by a return
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Player:
     """One virtual person; leaves are scalars, or of the lanes' shape when several are stacked."""
 
@@ -166,8 +160,7 @@ class Player:
     person: Person
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PlayerState:
     """State of a player from ball to ball."""
 
@@ -176,8 +169,7 @@ class PlayerState:
     expected: Float[Array, "3 *batch"]  # [m], [m], [m/s] landing x, y and speed of the robot's returns so far
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Incoming:
     """A robot's return as the player meets it."""
 
@@ -186,14 +178,12 @@ class Incoming:
     seconds: Float[Array, "*batch"]  # from the robot's hit to the contact
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Answer:
     """A player's stroke."""
 
     ball: BallState  # (3, ...) as it leaves the paddle, or as it came where it was missed
     hit: Bool[Array, "*batch"]
-    difficulty: Float[Array, "*batch"]
     state: PlayerState
 
 
@@ -244,12 +234,9 @@ def wish(
     player: Player, key: PRNGKeyArray, shape: tuple[int, ...]
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Plane y and height z [m] at which the players mean to take the next return."""
-    plane, height = jax.random.split(key)
-    strokes = player.strokes
-    return (
-        strokes.plane.draw(plane, shape, strokes.steadiness, WIDE),
-        strokes.height.draw(height, shape, strokes.steadiness, WIDE),
-    )
+    strokes, (plane_key, height_key) = player.strokes, jax.random.split(key)
+    plane = strokes.plane.draw(plane_key, shape, strokes.steadiness, WIDE)
+    return plane, strokes.height.draw(height_key, shape, strokes.steadiness, WIDE)
 
 
 def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Incoming, flight: FlightParams) -> Answer:
@@ -265,18 +252,14 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
     p_miss = jnp.clip(ability.miss + jax.nn.sigmoid((hard - ability.limit) / (0.12 * ability.limit)) + far, 0.0, 1.0)
     hit = jax.random.uniform(next(keys), shape) >= p_miss
 
-    target = jnp.stack(
-        [
-            strokes.aim_x.draw(next(keys), shape, strokes.steadiness, WIDE),
-            strokes.aim_y.draw(next(keys), shape, strokes.steadiness, WIDE),
-            jnp.full(shape, c.BALL_RADIUS),
-        ]
-    )
-    wanted = strokes.speed.draw(next(keys), shape, strokes.steadiness, WIDE) + strokes.counter * (speed - 3.5)
+    def draw(spread: Spread) -> Array:
+        return spread.draw(next(keys), shape, strokes.steadiness, WIDE)
+
+    target = jnp.stack([draw(strokes.aim_x), draw(strokes.aim_y), jnp.full(shape, c.BALL_RADIUS)])
+    wanted = draw(strokes.speed) + strokes.counter * (speed - 3.5)
     wanted = wanted + strokes.attack * jnp.maximum(ball.position[2] - COMFORTABLE_HEIGHT, 0.0)
     wanted = jnp.clip(wanted, strokes.speed.low, strokes.speed.high)
-    clearance = strokes.clearance.draw(next(keys), shape, strokes.steadiness, WIDE)
-    seconds = estimate_stroke_seconds(ball.position, target, wanted, clearance)
+    seconds = estimate_stroke_seconds(ball.position, target, wanted, draw(strokes.clearance))
     seconds = jnp.minimum(seconds, estimate_fall_seconds(strokes.climb, ball.position[2]))
     spin = _spin(player.spin, next(keys), target - ball.position)
     velocity = aim_stroke(flight, ball.position, target, seconds, spin)
@@ -293,7 +276,7 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
         expected=state.expected + row(jnp.maximum(person.adapting, 0.1)) * (met - state.expected),
     )
     left = BallState(ball.position, jnp.where(hit, velocity, ball.velocity), jnp.where(hit, spin, ball.spin))
-    return Answer(left, hit, hard, after)
+    return Answer(left, hit, after)
 
 
 def difficulty(player: Player, state: PlayerState, incoming: Incoming) -> Float[Array, "*batch"]:
@@ -308,13 +291,8 @@ def difficulty(player: Player, state: PlayerState, incoming: Incoming) -> Float[
     met = (incoming.landing[0], incoming.landing[1], speed)
     away = sum(((m - e) / unit) ** 2 for m, e, unit in zip(met, state.expected, SURPRISE, strict=True))
     strange = 1.0 - 0.7 * state.familiarity
-    return (
-        stretch(ability, incoming)
-        + lean
-        + height
-        + fast
-        + strange * (spin + player.person.strangeness * jnp.sqrt(away))
-    )
+    surprise = strange * (spin + player.person.strangeness * jnp.sqrt(away))
+    return stretch(ability, incoming) + lean + height + fast + surprise
 
 
 def stretch(ability: Ability, incoming: Incoming) -> Float[Array, "*batch"]:
@@ -364,15 +342,14 @@ def read(path: str | os.PathLike) -> Player:
 
 def to_dict(player: Player) -> dict[str, Any]:
     """The YAML form of a player with scalar leaves."""
-    return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
 
+    def plain(part: Any) -> Any:
+        if not dataclasses.is_dataclass(part):
+            return round(float(part), 4)
+        values = {f.name: plain(getattr(part, f.name)) for f in dataclasses.fields(part)}
+        return list(values.values()) if isinstance(part, Spread) else values
 
-def _plain(player: Any) -> dict[str, Any] | list[float] | float:
-    if isinstance(player, Spread):
-        return [round(float(value), 4) for value in (player.low, player.usual, player.high)]
-    if dataclasses.is_dataclass(player):
-        return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
-    return round(float(player), 4)
+    return plain(player)
 
 
 def stack(players: list[Player]) -> Player:

@@ -11,23 +11,23 @@ home pose: the rally is over, and the next ball is a dummy that only brings it b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.partial_params import without_nominal
 from ballmodel.registry import Balls, box_of
 from ballmodel.state import BallState, where
-from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, EpisodeState
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
+from mjx_tt.pytrees import pytree
 from mjx_tt.rally import ball_flights, human_player
 from mjx_tt.rally.ball_flights import drive_home, make_column
 from mjx_tt.rally.end_reasons import End, find_end
@@ -41,8 +41,7 @@ BLIND = 0.003  # probability that the tracker loses a first ball and the robot d
 BY_HAND = 0.5  # share of the dummy balls that are thrown by hand
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Box:
     """Bounds of a ball distribution: position (3), velocity (3), landing (2); (8,) or (8, L)."""
 
@@ -65,8 +64,7 @@ class Box:
         return jnp.all((values >= low) & (values <= high), axis=0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RallyState:
     """Lanes between two turns; the next ball is about to leave the player's paddle."""
 
@@ -77,8 +75,7 @@ class RallyState:
     dummy: Bool[Array, " L"]  # the robot stands in the arm's own home pose
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ShotResult:
     """One turn of every lane."""
 
@@ -93,43 +90,18 @@ class ShotResult:
     fault: Bool[Array, " L"]  # the robot stopped itself
     end: Int[Array, " L"]  # End; NONE where the rally goes on
     return_landing: Float[Array, "2 L"]  # [m] where the robot's ball came down, NaN where it hit none
-    robot_peak: Float[Array, "joints L"]  # [m/s], [rad/s]
     seconds: Float[Array, " L"]  # [s] until the player's next contact, or until the ball was over
     steps: Int[Array, " L"]  # of the policy
     observed: Float[Array, "2 observed L"]  # sums over them of what it saw less its mean, and of the squares
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class BallLog:
-    """Human hits, up to a capacity per lane; slots past ``count`` are zero."""
-
-    rally: Int[Array, "capacity L"]  # index of the rally in its lane
-    touch: Int[Array, "capacity L"]
-    position: Float[Array, "3 capacity L"]  # [m] at the human's contact
-    velocity: Float[Array, "3 capacity L"]  # [m/s]
-    spin: Float[Array, "3 capacity L"]  # [rad/s]
-    landing: Float[Array, "2 capacity L"]  # [m] on the robot's side, NaN where there was none
-    hit: Bool[Array, "capacity L"]  # by the robot
-    returned: Bool[Array, "capacity L"]
-    return_landing: Float[Array, "2 capacity L"]  # [m], NaN where the robot hit none
-    count: Int[Array, " L"]  # hits, those that found no room included
-
-    @property
-    def first(self) -> Bool[Array, "capacity L"]:
-        """True for balls that started a rally."""
-        return self.touch == 1
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class RallyResult:
     """Rallies of all lanes."""
 
     length: Int[Array, "rallies L"]  # paddle touches of human and robot
     end: Int[Array, "rallies L"]  # End
     seconds: Float[Array, "rallies L"]  # [s] of play
-    balls: BallLog
     player: PlayerState  # (L,) as the session left them
 
 
@@ -139,7 +111,7 @@ class RallySimulator:
     def __init__(self, config: TaskConfig) -> None:
         self.config = config
         self.task = Task(config)
-        self._play = jax.jit(self._play_all, static_argnames=("rallies", "max_touches", "capacity"))
+        self._play = jax.jit(self._play_all, static_argnames=("rallies", "max_touches"))
         self._shots = jax.jit(self._turn)
         self._start = jax.jit(self._start_lanes, static_argnames="lanes")
 
@@ -178,25 +150,14 @@ class RallySimulator:
         rallies: int,
         box: Box | Balls | None = None,
         max_touches: int = 400,
-        capacity: int = 0,
     ) -> RallyResult:
         """``rallies`` rallies of every lane, one after the other, in one compiled call.
 
         policy: theta (976, L), normaliser (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
-        of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per
-        lane that the log keeps.
+        of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches.
         """
         box = box if box is None or isinstance(box, Box) else Box.of(box)
-        return self._play(
-            policy,
-            player,
-            without_nominal(model),
-            key,
-            box,
-            rallies=rallies,
-            max_touches=max_touches,
-            capacity=max(capacity, 1),
-        )
+        return self._play(policy, player, without_nominal(model), key, box, rallies=rallies, max_touches=max_touches)
 
     # -- turns ---------------------------------------------------------------------------------------------------------
 
@@ -221,7 +182,7 @@ class RallySimulator:
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
         sent = ball_flights.fly_serve(model.ball, ball, self.config.period)
-        robot = self._robot(next(keys), policy, model, ball, state.start)
+        robot = self.task.play(controller_of(policy), self._episodes(next(keys), model, ball, state.start))
         blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
         finite = robot.finite
         fault = ((robot.accumulators.terms["collision"] > 0.0) | ~finite) & ~blind
@@ -266,19 +227,11 @@ class RallySimulator:
             fault=fault,
             end=end.astype(jnp.int8),
             return_landing=jnp.where(hit, back.landing, nowhere),
-            robot_peak=robot.accumulators.peak_velocity,
             seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
             steps=robot.accumulators.steps.astype(jnp.int32),
             observed=jnp.stack([robot.accumulators.observation, robot.accumulators.observation_sq]),
         )
         return after, result, state.touches + hit.astype(jnp.int32)
-
-    def _robot(
-        self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
-    ) -> EpisodeState:
-        """The robot's part of one episode: its last state."""
-        episodes = self._episodes(key, model, ball, start)
-        return self.task.play(controller_of(policy), episodes)
 
     def _episodes(
         self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
@@ -306,7 +259,6 @@ class RallySimulator:
         *,
         rallies: int,
         max_touches: int,
-        capacity: int,
     ) -> RallyResult:
         lanes = policy.theta.shape[-1]
         start_key, key = jax.random.split(key)
@@ -317,16 +269,13 @@ class RallySimulator:
             jnp.full((rallies, lanes), End.NONE, jnp.int8),
             jnp.zeros((rallies, lanes)),
         )
-        whole, some = jnp.zeros((capacity, lanes), jnp.int32), jnp.zeros((capacity, lanes), bool)
-        three, two = (jnp.zeros((n, capacity, lanes)) for n in (3, 2))
-        log = BallLog(whole, whole, three, three, three, two, some, some, two, jnp.zeros(lanes, jnp.int32))
 
         def unfinished(carry: tuple) -> Array:
             turn, _, done, *_ = carry
             return jnp.any(done < rallies) & (turn < rallies * (max_touches + 2))
 
         def advance(carry: tuple) -> tuple:
-            turn, state, done, seconds, (length, end, spent), log = carry
+            turn, state, done, seconds, (length, end, spent) = carry
             key_turn, key_dummy = jax.random.split(jax.random.fold_in(key, turn))
             after, shot, touches = self._turn(policy, player, model, state, key_turn, box, max_touches)
             # A dummy ball is a turn of its own in which nobody plays: the ball that waits is thrown afterwards.
@@ -342,40 +291,10 @@ class RallySimulator:
             length = length.at[row, lane].set(touches, mode="drop")
             end = end.at[row, lane].set(why.astype(jnp.int8), mode="drop")
             spent = spent.at[row, lane].set(seconds, mode="drop")
-            log = _logged(log, done, shot, playing & ~dummy, lane)
             state = replace(jax.tree.map(partial(jnp.where, dummy), state, after), dummy=after.dummy & ~dummy)
-            return (
-                turn + 1,
-                state,
-                done + over.astype(jnp.int32),
-                jnp.where(over, 0.0, seconds),
-                (length, end, spent),
-                log,
-            )
+            seconds = jnp.where(over, 0.0, seconds)
+            return turn + 1, state, done + over.astype(jnp.int32), seconds, (length, end, spent)
 
-        carry = (jnp.int32(0), state, jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes), table, log)
-        _, state, _, _, (length, end, spent), log = jax.lax.while_loop(unfinished, advance, carry)
-        return RallyResult(length, end, spent, log, state.player)
-
-
-def _logged(
-    log: BallLog, rally: Int[Array, " L"], shot: ShotResult, keep: Bool[Array, " L"], lane: Int[Array, " L"]
-) -> BallLog:
-    capacity = log.touch.shape[0]
-    slot = jnp.where(keep, log.count, capacity)
-
-    def put(buffer: Array, value: Array | np.ndarray) -> Array:
-        return buffer.at[..., slot, lane].set(value, mode="drop")
-
-    return BallLog(
-        rally=put(log.rally, rally),
-        touch=put(log.touch, shot.touch),
-        position=put(log.position, shot.ball.position),
-        velocity=put(log.velocity, shot.ball.velocity),
-        spin=put(log.spin, shot.ball.spin),
-        landing=put(log.landing, shot.landing),
-        hit=put(log.hit, shot.outcome != MISSED),
-        returned=put(log.returned, shot.outcome == RETURNED),
-        return_landing=put(log.return_landing, shot.return_landing),
-        count=log.count + keep.astype(jnp.int32),
-    )
+        carry = (jnp.int32(0), state, jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes), table)
+        _, state, _, _, (length, end, spent) = jax.lax.while_loop(unfinished, advance, carry)
+        return RallyResult(length, end, spent, state.player)

@@ -8,14 +8,13 @@ change the motion is either carried by ``Chain`` or refused by name. MuJoCo's co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjx_tt.robot.checks import object_name, unsupported
-
-Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]
+from mjx_tt.robot.scalar_algebra import Constant, ConstantMatrix, matrix, vector
 
 WORLD = -1  # link index of everything that does not move
 
@@ -34,13 +33,13 @@ class Link:
 
     name: str  # the joint's name
     slide: bool  # True: slide, q in m; False: hinge, q in rad
-    axis: Vector  # unit vector
-    anchor: Vector  # [m]
-    pos: Vector  # origin in the parent link's frame at q = 0 [m]
-    rot: Matrix  # rotation of this frame in the parent link's frame at q = 0
+    axis: Constant  # unit vector
+    anchor: Constant  # [m]
+    pos: Constant  # origin in the parent link's frame at q = 0 [m]
+    rot: ConstantMatrix  # rotation of this frame in the parent link's frame at q = 0
     mass: float  # [kg]; 0 for all but the last joint of a body with several joints
-    com: Vector  # [m]
-    inertia: Matrix  # about the centre of mass [kg m^2]
+    com: Constant  # [m]
+    inertia: ConstantMatrix  # about the centre of mass [kg m^2]
     armature: float  # [kg], [kg m^2]
     damping: float  # [N s/m], [N m s/rad]
     gravcomp: float  # fraction of this link's weight that is compensated at its centre of mass
@@ -56,8 +55,7 @@ class Chain:
     """A serial chain, link 0 on the world. All tuples of floats: it is hashable and can be a static argument of jit."""
 
     links: tuple[Link, ...]
-    n_ctrl: int
-    gravity: Vector  # world frame [m/s^2]
+    gravity: Constant  # world frame [m/s^2]
     timestep: float  # [s]
 
 
@@ -100,26 +98,25 @@ def chain_from_model(model: mujoco.MjModel) -> Chain:
             at_zero = _axis_rotation(axis, -ref)
             pos, rot = pos + rot @ (anchor - at_zero @ anchor), rot @ at_zero
         mass, com, inertia, gravcomp = inertias[joint]
-        dof, actuator = int(model.jnt_dofadr[joint]), actuator_of.get(joint)
+        dof = int(model.jnt_dofadr[joint])
         links.append(
             Link(
                 name=object_name(model, mujoco.mjtObj.mjOBJ_JOINT, joint),
                 slide=bool(slide),
-                axis=_floats(axis),
-                anchor=_floats(anchor),
-                pos=_floats(pos),
-                rot=_rows(rot),
+                axis=vector(axis),
+                anchor=vector(anchor),
+                pos=vector(pos),
+                rot=matrix(rot),
                 mass=mass,
-                com=_floats(com),
-                inertia=_rows(inertia),
+                com=vector(com),
+                inertia=matrix(inertia),
                 armature=float(model.dof_armature[dof]),
                 damping=float(model.dof_damping[dof]),
                 gravcomp=gravcomp,
-                ctrl_index=-1 if actuator is None else actuator,
-                **_actuation(model, actuator),
+                **_actuation(model, actuator_of.get(joint)),
             )
         )
-    return Chain(tuple(links), int(model.nu), _floats(model.opt.gravity), float(model.opt.timestep))
+    return Chain(tuple(links), vector(model.opt.gravity), float(model.opt.timestep))
 
 
 def body_frames(model: mujoco.MjModel) -> list[Frame]:
@@ -173,28 +170,15 @@ def _merged_inertias(model: mujoco.MjModel, frames: list[Frame]) -> list[tuple[f
     return merged
 
 
-def _actuation(model: mujoco.MjModel, actuator: int | None) -> dict[str, float]:
+def _actuation(model: mujoco.MjModel, actuator: int | None) -> dict[str, Any]:
+    """The fields of a ``Link`` from ``ctrl_index`` on."""
     if actuator is None:
-        return dict(gain=0.0, bias0=0.0, bias_qpos=0.0, bias_qvel=0.0)
+        return dict(ctrl_index=-1, gain=0.0, bias0=0.0, bias_qpos=0.0, bias_qvel=0.0)
     gear = float(model.actuator_gear[actuator, 0])
     affine = model.actuator_biastype[actuator] == _AFFINE_BIAS
-    bias = [float(b) for b in model.actuator_biasprm[actuator, :3]] if affine else [0.0, 0.0, 0.0]
-    return dict(
-        gain=gear * float(model.actuator_gainprm[actuator, 0]),
-        bias0=gear * bias[0],
-        bias_qpos=gear**2 * bias[1],
-        bias_qvel=gear**2 * bias[2],
-    )
-
-
-def _floats(values: np.ndarray) -> Vector:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
-
-
-def _rows(values: np.ndarray) -> Matrix:
-    x, y, z = (_floats(row) for row in values)
-    return x, y, z
+    bias0, qpos, qvel = (float(b) if affine else 0.0 for b in model.actuator_biasprm[actuator, :3])
+    gain = gear * float(model.actuator_gainprm[actuator, 0])
+    return dict(ctrl_index=actuator, gain=gain, bias0=gear * bias0, bias_qpos=gear**2 * qpos, bias_qvel=gear**2 * qvel)
 
 
 def _snap(matrix: np.ndarray) -> np.ndarray:

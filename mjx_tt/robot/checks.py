@@ -15,6 +15,13 @@ _DISABLE, _OBJ = mujoco.mjtDisableBit, mujoco.mjtObj
 # As int: an enumerator of MuJoCo does not equal the NumPy integers that the model's arrays hold.
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_JOINT_FIELDS = {  # that must be zero, and why
+    "jnt_stiffness": "joint stiffness is not supported",
+    "jnt_stiffnesspoly": "polynomial joint stiffness is not supported",
+    "dof_dampingpoly": "only linear damping is supported",
+    "dof_frictionloss": "frictionloss is not supported",
+    "jnt_actfrclimited": "actuatorfrcrange is not supported",
+}
 _ACTUATOR_TYPES = (  # field, type, accepted values
     ("dyntype", mujoco.mjtDyn, (int(mujoco.mjtDyn.mjDYN_NONE),)),
     ("gaintype", mujoco.mjtGain, (int(mujoco.mjtGain.mjGAIN_FIXED),)),
@@ -53,16 +60,21 @@ def _unsupported_options(model: mujoco.MjModel) -> Iterator[str]:
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         yield f"option integrator: only implicitfast is supported, got {integrator.name}"
-    for option in ("density", "viscosity"):
-        if getattr(model.opt, option):
-            yield f"option {option}: must be 0 (no fluid forces), got {getattr(model.opt, option)}"
-    for flag in ("ACTUATION", "GRAVITY", "DAMPER"):
-        if _disabled(model, getattr(_DISABLE, f"mjDSBL_{flag}")):
-            yield f"option flag {flag.lower()}: must stay enabled"
+    yield from altered_forces(model)
     if model.opt.disableactuator:
         yield "option actuatorgroupdisable: disabled actuator groups are not supported"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         yield "option flag sleep: must stay disabled"
+
+
+def altered_forces(model: mujoco.MjModel) -> Iterator[str]:
+    """One sentence for every option that adds forces to the model or takes some away."""
+    for option in ("density", "viscosity"):
+        if value := getattr(model.opt, option):
+            yield f"option {option}: must be 0 (no fluid forces), got {value:g}"
+    for flag in ("ACTUATION", "GRAVITY", "DAMPER"):
+        if _disabled(model, getattr(_DISABLE, f"mjDSBL_{flag}")):
+            yield f"option flag {flag.lower()}: must stay enabled"
 
 
 def _unsupported_joints(model: mujoco.MjModel) -> Iterator[str]:
@@ -75,17 +87,11 @@ def _unsupported_joints(model: mujoco.MjModel) -> Iterator[str]:
             kind = mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
             yield f"{name}: {kind} joints are not supported, only hinge and slide"
             continue
-        dof = model.jnt_dofadr[joint]
-        if _any(model, "jnt_stiffness", joint) or _any(model, "jnt_stiffnesspoly", joint):
-            yield f"{name}: joint stiffness is not supported"
-        if _any(model, "dof_dampingpoly", dof):
-            yield f"{name}: only linear damping is supported"
-        if model.dof_frictionloss[dof]:
-            yield f"{name}: frictionloss is not supported"
+        for field, reason in _JOINT_FIELDS.items():
+            if _any(model, field, model.jnt_dofadr[joint] if field.startswith("dof") else joint):
+                yield f"{name}: {reason}"
         if model.jnt_limited[joint] and limits_act:
             yield f'{name}: joint limits need constraints to be disabled (<flag constraint="disable"/>)'
-        if model.jnt_actfrclimited[joint]:
-            yield f"{name}: actuatorfrcrange is not supported"
 
 
 def _unsupported_bodies(model: mujoco.MjModel, carriers: list[int]) -> Iterator[str]:

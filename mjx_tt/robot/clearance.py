@@ -8,7 +8,6 @@ loops.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import jax
@@ -18,7 +17,7 @@ from jaxtyping import Float
 
 from ballmodel.contact import TABLE, Box, box_gap
 from ballmodel.vec import dot
-from mjx_tt.robot.chain import Frame
+from mjx_tt.pytrees import pytree
 from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
 from mjx_tt.robot.mjcf import Capsule
 from mjx_tt.robot.scalar_algebra import optimization_barrier
@@ -61,8 +60,7 @@ def segment_distance(p1: jax.Array, q1: jax.Array, p2: jax.Array, q2: jax.Array)
     return jnp.sqrt(dot(gap, gap))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Clearances:
     """Smallest gaps [m], (...); negative or zero: in contact."""
 
@@ -83,21 +81,16 @@ class CapsuleClearance:
             raise ValueError(f"the model lacks the capsules {missing}; it has {sorted(self._capsules)}")
         self._watched = needed
 
-    def segments(
-        self, poses: list[LinkPose], like: Float[jax.Array, "*batch"]
-    ) -> dict[str, tuple[Float[jax.Array, "3 *batch"], Float[jax.Array, "3 *batch"]]]:
-        """World end points, each (3, ...), of every watched capsule by name."""
-
-        def ends(capsule: Capsule) -> tuple[jax.Array, jax.Array]:
-            frame = Frame(capsule.link, np.zeros(3), np.eye(3))
-            p0, p1 = (stack(self._kinematics.point(poses, frame, p), like) for p in (capsule.p0, capsule.p1))
-            return p0, p1
-
-        return {name: ends(capsule) for name, capsule in self._capsules.items() if name in self._watched}
-
     def __call__(self, poses: list[LinkPose], like: Float[jax.Array, "*batch"]) -> Clearances:
         """Clearances from links' world poses (``PaddleKinematics.links``); ``like`` gives the batch shape."""
-        ends = optimization_barrier(self.segments(poses, like))
+
+        def place(capsule: Capsule) -> tuple[jax.Array, jax.Array]:
+            """World end points, each (3, ...)."""
+            p, q = (stack(self._kinematics.point(poses, capsule.link, x), like) for x in (capsule.p0, capsule.p1))
+            return p, q
+
+        watched = {name: place(capsule) for name, capsule in self._capsules.items() if name in self._watched}
+        ends = optimization_barrier(watched)
         batch = (1,) * like.ndim
 
         # Both ends (3, len(names), ...) and the radii (len(names), 1...).

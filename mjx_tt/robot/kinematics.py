@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from ballmodel.flight import PaddlePose
 from mjx_tt.lanes.functions import sin_cos
@@ -18,6 +17,9 @@ from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
 Joints: TypeAlias = Float[jax.Array, "n *batch"]  # [m], [m/s] of slides, [rad], [rad/s] of hinges
+
+
+LinkPose: TypeAlias = tuple[f.Matrix, f.Vector]  # rotation and origin of a link's frame, folded scalars
 
 
 def centred_on_anchors(chain: Chain) -> Chain:
@@ -31,10 +33,10 @@ def centred_on_anchors(chain: Chain) -> Chain:
     return replace(chain, links=tuple(links))
 
 
-def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]:
-    """Rotation and origin of every link in its parent's frame at joint positions q (n, ...), folded scalars."""
+def joint_transforms(chain: Chain, q: Joints) -> list[LinkPose]:
+    """Pose of every link in its parent's frame at joint positions q (n, ...)."""
     sin, cos = f.optimization_barrier(sin_cos(q))  # of slides too: one loop over all joints is the cheapest
-    transforms: list[tuple[f.Matrix, f.Vector]] = []
+    transforms: list[LinkPose] = []
     for i, link in enumerate(chain.links):
         if link.slide:
             along = f.matvec(link.rot, link.axis)
@@ -46,86 +48,56 @@ def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]
     return transforms
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class LinkPose:
-    """World pose of one link's frame, folded scalars."""
-
-    rot: f.Matrix
-    pos: f.Vector
-
-
-def forward(chain: Chain, q: Joints) -> list[LinkPose]:
-    """World pose of every link of a chain that is ``centred_on_anchors``, at joint positions q (n, ...)."""
-    poses: list[LinkPose] = []
-    rot: f.Matrix = f.EYE3
-    pos: f.Vector = f.ZERO3
-    for r, p in joint_transforms(chain, q):
-        pos = f.vadd(pos, f.matvec(rot, p))
-        rot, pos = f.optimization_barrier((f.matmul(rot, r), pos))
-        poses.append(LinkPose(rot, pos))
-    return poses
-
-
-def point_motion(
-    chain: Chain, link: int, point: f.Vector, direction: f.Vector, q: Joints, qd: Joints
-) -> tuple[f.Vector, f.Vector, f.Vector, f.Vector]:
-    """World position and velocity of a point, direction and angular velocity of the link that it is fixed to.
-
-    chain: ``centred_on_anchors``; point, direction: constants in the link's frame; q, qd: (n, ...).
-    Goes from the link to the base, seen from each joint in turn: four vectors a joint, where going outwards takes a
-    rotation matrix more. Folded scalars: position, direction, velocity, angular velocity.
-    """
-    transforms = joint_transforms(chain, q)
-    velocity: f.Vector = f.ZERO3
-    spin: f.Vector = f.ZERO3
-    for i in reversed(range(link + 1)):
-        joint_velocity = f.vscale(chain.links[i].axis, qd[i])
-        if chain.links[i].slide:
-            velocity = f.vadd(velocity, joint_velocity)
-        else:
-            velocity = f.vadd(velocity, f.cross(joint_velocity, point))
-            spin = f.vadd(spin, joint_velocity)
-        rot, pos = transforms[i]
-        point = f.vadd(f.matvec(rot, point), pos)
-        direction, velocity, spin = (f.matvec(rot, x) for x in (direction, velocity, spin))
-        if i % 3 == 0:  # storing every third is the cheapest
-            point, direction, velocity, spin = f.optimization_barrier((point, direction, velocity, spin))
-    return point, direction, velocity, spin
-
-
-def to_world(chain: Chain, poses: list[LinkPose], frame: Frame, point: ArrayLike) -> f.Vector:
-    """World coordinates, as folded scalars, of a point given in ``frame`` (fixed to a link of the original chain)."""
-    local = np.asarray(frame.pos) + np.asarray(frame.rot) @ np.asarray(point, float)
-    if frame.link == WORLD:
-        return f.vector(local)
-    local = local - np.array(chain.links[frame.link].anchor)
-    pose = poses[frame.link]
-    return f.vadd(pose.pos, f.matvec(pose.rot, f.vector(local)))
-
-
 class PaddleKinematics:
-    """Pose and motion of the paddle's site for joint states of shape (n, ...)."""
+    """Poses of a chain's links, and pose and motion of the paddle's site, for joint states of shape (n, ...)."""
 
     def __init__(self, chain: Chain, site: Frame) -> None:
-        self._chain = chain
-        self._centred = centred_on_anchors(chain)
+        self._chain = centred_on_anchors(chain)
+        self._anchors = [np.array(link.anchor) for link in chain.links]
         self._site = site
 
     def links(self, q: Joints) -> list[LinkPose]:
-        return forward(self._centred, q)
+        """World pose of every link, whose frame is at its joint's anchor."""
+        poses: list[LinkPose] = []
+        rot: f.Matrix = f.EYE3
+        pos: f.Vector = f.ZERO3
+        for r, p in joint_transforms(self._chain, q):
+            pos = f.vadd(pos, f.matvec(rot, p))
+            rot, pos = f.optimization_barrier((f.matmul(rot, r), pos))
+            poses.append((rot, pos))
+        return poses
 
-    def point(self, poses: list[LinkPose], frame: Frame, point: ArrayLike) -> f.Vector:
-        return to_world(self._chain, poses, frame, point)
+    def point(self, poses: list[LinkPose], link: int, point: np.ndarray) -> f.Vector:
+        """World coordinates, as folded scalars, of a point (3,) given in the frame of a link of the original chain."""
+        if link == WORLD:
+            return f.vector(point)
+        rot, pos = poses[link]
+        return f.vadd(pos, f.matvec(rot, f.vector(point - self._anchors[link])))
 
     def pose(self, q: Joints, qd: Joints) -> PaddlePose:
-        """Blade centre [m], unit normal (the site's z axis), velocity [m/s] and angular velocity [rad/s], each (3,
-        ...)."""
-        link = self._site.link
-        centre = f.vector(np.asarray(self._site.pos) - np.array(self._chain.links[link].anchor))
-        blade_normal = f.vector(np.asarray(self._site.rot)[:, 2])
-        position, normal, velocity, spin = point_motion(self._centred, link, centre, blade_normal, q, qd)
-        return PaddlePose(*(stack(v, q[0]) for v in (position, normal, velocity, spin)))
+        """Blade centre [m], unit normal (the site's z axis), velocity [m/s], angular velocity [rad/s], each (3, ...).
+
+        Goes from the site's link to the base, seen from each joint in turn: four vectors a joint, where going outwards
+        takes a rotation matrix more.
+        """
+        links, transforms = self._chain.links, joint_transforms(self._chain, q)
+        point: f.Vector = f.vector(self._site.pos - self._anchors[self._site.link])
+        normal: f.Vector = f.vector(self._site.rot[:, 2])
+        velocity: f.Vector = f.ZERO3
+        spin: f.Vector = f.ZERO3
+        for i in reversed(range(self._site.link + 1)):
+            joint_velocity = f.vscale(links[i].axis, qd[i])
+            if links[i].slide:
+                velocity = f.vadd(velocity, joint_velocity)
+            else:
+                velocity = f.vadd(velocity, f.cross(joint_velocity, point))
+                spin = f.vadd(spin, joint_velocity)
+            rot, pos = transforms[i]
+            point = f.vadd(f.matvec(rot, point), pos)
+            normal, velocity, spin = (f.matvec(rot, x) for x in (normal, velocity, spin))
+            if i % 3 == 0:  # storing every third is the cheapest
+                point, normal, velocity, spin = f.optimization_barrier((point, normal, velocity, spin))
+        return PaddlePose(*(stack(v, q[0]) for v in (point, normal, velocity, spin)))
 
 
 def stack(values: Sequence[f.Scalar], like: Float[jax.Array, "*batch"]) -> Float[jax.Array, "n *batch"]:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjx_tt.robot.chain import body_frames
-from mjx_tt.robot.checks import unsupported
+from mjx_tt.robot.checks import altered_forces, unsupported
 from mjx_tt.robot.mjcf import PADDLE_SITE, capsules
 from mjx_tt.sim.actuators import EFFECTS
 from robot_io.robot_file import RobotFile
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
-_DISABLED = ("ACTUATION", "GRAVITY", "DAMPER")
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _NEEDED_FILES = re.compile(r"<include\b|<(mesh|hfield|skin|model|texture)\b[^>]*\bfile\s*=")
 _REMEDIES = {  # words of ``checks.unsupported``: what to change
@@ -38,26 +38,12 @@ def needs_files(mjcf: str) -> bool:
     return _NEEDED_FILES.search(mjcf) is not None
 
 
-def find_mistakes(
-    file: RobotFile,
-    own_spec: Callable[[], mujoco.MjSpec],
-    at_table: Callable[[], mujoco.MjModel],
-    where: str,
-    yaml: str,
-) -> Iterator[str]:
-    """One line for every mistake of a robot.
-
-    Args:
-        file: its YAML.
-        own_spec: gives the MJCF as its author wrote it.
-        at_table: compiles the robot at the table.
-        where: names the MJCF in messages.
-        yaml: names the YAML.
-    """
+def find_mistakes(robot: Any, where: str, yaml: str) -> Iterator[str]:
+    """One line for every mistake of a ``robots.Robot``. where, yaml: names of its MJCF and its YAML in messages."""
+    file = robot.file
     yield from _drives(file, yaml)
     try:
-        own = own_spec()
-        alone = own.compile()
+        alone = robot.own_spec().compile()
     except ValueError as error:
         yield f"{where}: MuJoCo cannot compile it: {_one_line(error)}"
         return
@@ -69,7 +55,7 @@ def find_mistakes(
     ]
     yield from found
     try:
-        model = at_table()
+        model = robot.model()
     except ValueError as error:
         yield f"{where}: cannot stand at the table: {_one_line(error)}; rename it, the scene has one of that name"
         return
@@ -91,15 +77,10 @@ def _drives(file: RobotFile, yaml: str) -> Iterator[str]:
 
 
 def _options(model: mujoco.MjModel, where: str) -> Iterator[str]:
-    for option in ("density", "viscosity"):
-        if getattr(model.opt, option):
-            value = getattr(model.opt, option)
-            yield f"{where}: option {option}: is {value:g}; remove it, fluid forces are not computed"
+    for line in altered_forces(model):
+        yield f"{where}: {line}; remove it"
     if not np.allclose(model.opt.gravity, GRAVITY):
         yield f"{where}: option gravity: is {model.opt.gravity.tolist()}; remove it, the court's is {list(GRAVITY)}"
-    for flag in _DISABLED:
-        if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
-            yield f"{where}: option flag {flag.lower()}: is disabled; remove it, it must stay enabled"
 
 
 def _joints(file: RobotFile, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:

@@ -26,8 +26,8 @@ import numpy as np
 
 from ballmodel.io import yaml
 from mjx_tt.robot import geometry, mjcf_checks
-from mjx_tt.robot.chain import Chain, Frame, chain_from_model, site_frame
-from mjx_tt.robot.mjcf import PADDLE_SITE, Capsule, capsules
+from mjx_tt.robot.chain import Chain, Frame, chain_from_model
+from mjx_tt.robot.mjcf import PADDLE_SITE, Capsule, capsules, paddle_frame
 from robot_io import robot_file
 from robot_io.contract import PAPER, Contract
 from robot_io.robot_file import RobotFile
@@ -70,10 +70,6 @@ class Robot:
         """The MJCF as its author wrote it. Raises ValueError in MuJoCo's words."""
         return mujoco.MjSpec.from_string(self.mjcf) if self.path is None else mujoco.MjSpec.from_file(self.path)
 
-    def spec(self) -> mujoco.MjSpec:
-        """The robot at the table, mounted, with the keyframe "home" and the site "paddle". Raises ValueError."""
-        return _assembled(self)
-
     def model(self) -> mujoco.MjModel:
         """A model of its own of the robot at the table. Raises ValueError naming what is wrong with the MJCF."""
         return copy.copy(_compiled(self))
@@ -87,7 +83,7 @@ class Robot:
 
     def paddle(self) -> Frame:
         """The blade's centre in the frame of the link that carries it; column 2 of ``rot`` is the striking normal."""
-        return site_frame(self.model(), PADDLE_SITE)
+        return paddle_frame(self.model())
 
     def capsules(self) -> list[Capsule]:
         return capsules(self.model())
@@ -103,9 +99,8 @@ def load(path: str | Path) -> Robot:
     Raises ValueError with a line for every mistake, naming file, key or element, and what to change; OSError where a
     file cannot be read.
     """
-    file = yaml_path(path)
-    data = content(file)
-    return from_content(data, str(file), _mjcf_path(file))
+    data, file, mjcf = _read(path)
+    return from_content(data, str(file), mjcf)
 
 
 def paper() -> Robot:
@@ -144,24 +139,22 @@ def yaml_path(path: str | Path) -> Path:
 
 def content(path: str | Path) -> dict[str, Any]:
     """The robot as plain data that stands alone: its YAML with the text of the MJCF in place of the file's name."""
+    return _read(path)[0]
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], Path, str | None]:
+    """The content, the YAML, and the path of the MJCF where that is a file of its own."""
     file = yaml_path(path)
     data = yaml.read(file)
     if not isinstance(data, dict) or not isinstance(data.get("mjcf"), str) or "<" in data["mjcf"]:
-        return data
+        return data, file, None
     mjcf = file.parent / data["mjcf"]
     try:
         text = mjcf.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: mjcf: {data['mjcf']} cannot be read: {error}; allowed: an MJCF's file") from None
     beside = {ELSEWHERE: str(mjcf.resolve())} if mjcf_checks.needs_files(text) else {}
-    return data | {"mjcf": text} | beside
-
-
-def _mjcf_path(file: Path) -> str | None:
-    """Path of the MJCF that a YAML names, for messages."""
-    data = yaml.read(file)
-    named = isinstance(data, dict) and isinstance(data.get("mjcf"), str) and "<" not in data["mjcf"]
-    return str(file.parent / data["mjcf"]) if named else None
+    return data | {"mjcf": text} | beside, file, str(mjcf)
 
 
 def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
@@ -177,7 +170,7 @@ def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
         raise ValueError(f"{where}: {path} is missing or was changed since; put the MJCF and its files back there")
     robot = Robot(parsed, parsed.mjcf, path)
     origin = mjcf or path or f"{where}: mjcf"
-    mistakes = list(mjcf_checks.find_mistakes(parsed, robot.own_spec, robot.model, origin, where))
+    mistakes = list(mjcf_checks.find_mistakes(robot, origin, where))
     if mistakes:
         raise ValueError("\n".join(mistakes))
     return robot
@@ -225,6 +218,7 @@ def rename_files(spec: mujoco.MjSpec, name: Callable[[Path], str]) -> None:
 
 
 def _assembled(robot: Robot) -> mujoco.MjSpec:
+    """The robot at the table, mounted, with the keyframe "home" and the site "paddle"."""
     scene, own = mujoco.MjSpec.from_string(_court()), robot.own_spec()
     if robot.path is not None:  # which ``scene`` is written far away from
         rename_files(own, str)

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any
 
 import jax
@@ -35,6 +35,7 @@ from jaxtyping import Float
 from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.vec import Scalars
+from mjx_tt.pytrees import pytree
 from robot_io.contract import JOINT_NAMES, LIMITS
 
 # "No limit" as numbers that no drive reaches: ten times the fastest joint's speed, and up to it within 10 microseconds.
@@ -44,8 +45,7 @@ SHORTEST = 1e-9  # [s], keeps exponents finite
 SWING_DAMPING = 0.1  # ratio z of a flexible mount, estimate: bolted metal without a damper
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class JointDrive:
     """One joint's drive; nominal it does nothing. Every field is a scalar or has the episodes' batch shape.
 
@@ -71,56 +71,18 @@ class JointDrive:
 EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DriveParams:
-    """The eight joints' drives, by ``robot_io.contract.JOINT_NAMES``; another robot's: ``drive_params``."""
-
-    gantry_x: JointDrive = field(default_factory=JointDrive)
-    gantry_y: JointDrive = field(default_factory=JointDrive)
-    joint_1: JointDrive = field(default_factory=JointDrive)
-    joint_2: JointDrive = field(default_factory=JointDrive)
-    joint_3: JointDrive = field(default_factory=JointDrive)
-    joint_4: JointDrive = field(default_factory=JointDrive)
-    joint_5: JointDrive = field(default_factory=JointDrive)
-    joint_6: JointDrive = field(default_factory=JointDrive)
-
-
 @functools.cache
 def drive_params(joints: tuple[str, ...]) -> Any:
-    """The class that holds the drives of these joints, as ``DriveParams`` does those of the paper's robot."""
-    if joints == JOINT_NAMES:
-        return DriveParams
+    """The class that holds the drives of these joints, a ``JointDrive`` by each one's name."""
     fields = [(joint, JointDrive, field(default_factory=JointDrive)) for joint in joints]
-    made = dataclasses.make_dataclass("DriveParams", fields, frozen=True)
+    made = dataclasses.make_dataclass("DriveParams", fields, frozen=True, namespace={"__module__": __name__})
     return jax.tree_util.register_dataclass(made, data_fields=list(joints), meta_fields=[])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Drives:
-    """The same by effect, each (n, ...), None where no joint has it: ready for the loop."""
-
-    action_delay: Float[Array, "joints *batch"] | None
-    observation_delay: Float[Array, "joints *batch"] | None
-    lag: Float[Array, "joints *batch"] | None
-    velocity_gain: Float[Array, "joints *batch"] | None
-    joint_offset: Float[Array, "joints *batch"] | None
-    velocity_limit: Float[Array, "joints *batch"] | None
-    acceleration_limit: Float[Array, "joints *batch"] | None
-    backlash: Float[Array, "joints *batch"] | None
-    coulomb_friction: Float[Array, "joints *batch"] | None
-    deadband: Float[Array, "joints *batch"] | None
-    resonance: Float[Array, "joints *batch"] | None
-
-    @property
-    def follows(self) -> bool:
-        """True where the velocity needs time to follow its command."""
-        return self.lag is not None or self.acceleration_limit is not None
+DriveParams = drive_params(JOINT_NAMES)  # of the paper's robot
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class DriveState:
     """State of the drives; None where an effect has none."""
 
@@ -131,8 +93,11 @@ class DriveState:
 
 def sort_by_effect(
     params: Any | None, shape: tuple[int, ...], dtype: DTypeLike, joints: tuple[str, ...] = JOINT_NAMES
-) -> Drives:
-    """The numbers of drives, as ``drive_params`` of the joints holds them, as arrays (n, *shape)."""
+) -> JointDrive:
+    """The numbers of drives, as ``drive_params`` of the joints holds them, as arrays (n, *shape).
+
+    An effect that no joint has is None: it costs nothing in the loop.
+    """
     nominal = dataclasses.asdict(JointDrive())
 
     def column(effect: str) -> Array | None:
@@ -141,19 +106,20 @@ def sort_by_effect(
             return None
         return jnp.stack([jnp.broadcast_to(jnp.asarray(value_or(v, nominal[effect]), dtype), shape) for v in values])
 
-    return Drives(**{effect: column(effect) for effect in EFFECTS})
+    return JointDrive(**{effect: column(effect) for effect in EFFECTS})
 
 
-def rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
+def rest(drives: JointDrive, qpos: Float[Array, "joints *batch"]) -> DriveState:
     """The drives of a robot that stands at qpos (n, ...), in the middle of every play."""
+    at_once = drives.lag is None and drives.acceleration_limit is None  # the velocity is what is commanded
     return DriveState(
-        jnp.zeros_like(qpos) if drives.follows else None,
+        None if at_once else jnp.zeros_like(qpos),
         qpos if drives.backlash is not None else None,
         jnp.zeros((2, *qpos.shape), qpos.dtype) if drives.resonance is not None else None,
     )
 
 
-def limit_command(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
+def limit_command(drives: JointDrive, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
     """Steps 2 to 5: the velocity (n, ...) that a delayed command (n, ...) asks of the drive in the end."""
     u = command
     if drives.deadband is not None:
@@ -168,7 +134,7 @@ def limit_command(drives: Drives, command: Float[Array, "joints *batch"]) -> Flo
 
 
 def step_lag(
-    drives: Drives, state: DriveState, u: Float[Array, "joints *batch"], timestep: float
+    drives: JointDrive, state: DriveState, u: Float[Array, "joints *batch"], timestep: float
 ) -> tuple[Float[Array, "joints *batch"], DriveState]:
     """Steps 6 and 7 over one substep [s] of constant u (n, ...): the mean velocity in it, and the state at its end.
 
@@ -194,7 +160,7 @@ def step_lag(
 
 
 def step_backlash(
-    drives: Drives,
+    drives: JointDrive,
     state: DriveState,
     qpos: Float[Array, "joints *batch"],
     qvel: Float[Array, "joints *batch"],
@@ -212,7 +178,7 @@ def step_backlash(
 
 
 def step_swing(
-    drives: Drives,
+    drives: JointDrive,
     state: DriveState,
     before: Float[Array, "joints *batch"],
     after: Float[Array, "joints *batch"],

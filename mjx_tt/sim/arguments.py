@@ -6,21 +6,19 @@ decides the program: which numbers these are, what stays nominal, ranges, how fl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Drawing, Randomised, Samples
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Arguments:
     """A simulation's numbers by dotted path, and what is drawn for every episode."""
 

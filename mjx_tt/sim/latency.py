@@ -11,7 +11,6 @@ that of tick n - m after them; a substep in which it changes gets the time-weigh
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +18,12 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int, Shaped
 
+from mjx_tt.pytrees import pytree
+
 SMALLEST = 1e-6  # [s]; a delay of zero reads the end of the period before, which is the same moment
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Delay:
     """A delay split into whole control periods and a rest, each of the batch shape."""
 
@@ -45,8 +45,8 @@ def split_action_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> De
     return Delay(m.astype(jnp.int32), seconds - m * period)
 
 
-def weigh_capture(delay: Delay, s: Int[Array, ""] | int, substeps: int, timestep: float) -> Array:
-    """Weight of the state at substep boundary ``s`` (0 .. substeps) in the captured state: linear interpolation."""
+def weigh_capture(delay: Delay, s: Int[Array, ""] | int, timestep: float) -> Array:
+    """Weight of the state at a control period's substep boundary ``s`` in the captured one: linear interpolation."""
     return jnp.clip(1.0 - jnp.abs(delay.rest / timestep - s), 0.0, 1.0)
 
 

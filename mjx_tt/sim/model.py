@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -32,6 +32,7 @@ from ballmodel.io.atomic_files import replacing
 from ballmodel.io.ranges import Within, find_note, type_hints
 from ballmodel.io.validation import nearest, validate
 from ballmodel.vec import Scalars
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim import randomisation
 from mjx_tt.sim.actuators import JointDrive, drive_params
 from mjx_tt.sim.randomisation import Drawing, Randomised
@@ -41,8 +42,7 @@ from mjx_tt.sim.sensors import SensingParams as SensingParams
 from robot_io.contract import JOINT_NAMES
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class LatencyParams:
     """Gaussian delays, drawn per episode [s]. Means and deviations: the paper's table of sensor latencies.
 
@@ -65,16 +65,14 @@ class LatencyParams:
 LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_action", "festo_action")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ActuationParams:
     """All drives alike: gain of the velocity command before the servo of the MJCF follows it."""
 
     velocity_gain: Annotated[Scalars, Within(-3.0, 3.0)] = 1.0  # reached over commanded velocity
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class BallSpinParams:
     """Spin of the incoming balls at their start [rad/s], Gaussian and drawn per episode.
 
@@ -95,8 +93,7 @@ def _ball() -> BallParams:
     return dataclasses.replace(ball, flight=dataclasses.replace(ball.flight, integrator="midpoint"))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class SimModel:
     """The simulation's parameters; the paper's drag-only ball, integrated to second order.
 
@@ -139,15 +136,11 @@ class ModelFile:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes parameters, ranges and provenance, whole or not at all. Drives only if the model has them."""
-        tree: dict = {}
-        for name, value in paths(self.model).items():
-            if name.startswith("drives.") and self.model.drives is None:
-                continue
-            *groups, leaf = name.split(".")
-            node = tree
-            for group in groups:
-                node = node.setdefault(group, {})
-            node[leaf] = value if isinstance(value, str) else float(value)
+        tree = _nest(
+            (name, value if isinstance(value, str) else float(value))
+            for name, value in paths(self.model).items()
+            if self.model.drives is not None or not name.startswith("drives.")
+        )
         tree["randomise"] = randomisation.to_dict(self.randomise)
         tree["provenance"] = self.provenance
         with replacing(Path(path)) as temporary:
@@ -249,14 +242,9 @@ def from_dict(data: Any, where: str, nominal: SimModel | None = None) -> ModelFi
 @cache
 def file_type(joints: tuple[str, ...] = JOINT_NAMES) -> Any:
     """Type of a model YAML for a robot with these joints: the tree of parameters, none of which is required."""
-    tree: dict[str, Any] = {}
-    for path, note in _notes(joints).items():
-        *groups, leaf = path.split(".")
-        node = tree
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[leaf] = Annotated[float, note] if isinstance(note, Within) else note
-    numbers = {path: note for path, note in _notes(joints).items() if isinstance(note, Within)}
+    notes = _notes(joints)
+    numbers = {path: note for path, note in notes.items() if isinstance(note, Within)}
+    tree = _nest((path, Annotated[float, note] if path in numbers else note) for path, note in notes.items())
     extra = {"randomise": randomisation.file_type(numbers) | None, "provenance": dict[str, Any] | None}
     return _mapping_type("Model", tree | extra)
 
@@ -277,6 +265,18 @@ def _reorder(content: Any, given: Any) -> Any:
     if not isinstance(content, dict):
         return content
     return {str(key): _reorder(content[str(key)], value) for key, value in given.items()}
+
+
+def _nest(leaves: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """The tree of the leaves with these dotted paths."""
+    tree: dict[str, Any] = {}
+    for path, value in leaves:
+        *groups, leaf = path.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[leaf] = value
+    return tree
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -102,10 +102,6 @@ class Samples:
         """The rows for numbers drawn uniformly from [0, 1)."""
         return self.rows().at(uniform)
 
-    def drawn(self, key: Key[Array, ""], shape: tuple[int, ...]) -> dict[str, Array]:
-        """Values of a batch of ``shape`` episodes."""
-        return self.rows().drawn(key, shape)
-
     def rows(self) -> Rows:
         """These samples as arrays of a program."""
         share = np.cumsum(self.weight) / self.weight.sum()
@@ -128,7 +124,7 @@ def drawn(key: Key[Array, ""], randomise: Sequence[Randomised | Drawing], shape:
     keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
     values: dict[str, Array] = {}
     for one, its_key in zip(randomise, keys, strict=False):
-        values |= one.drawn(its_key, shape)
+        values |= (one.rows() if isinstance(one, Samples) else one).drawn(its_key, shape)
     return values
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,6 +14,7 @@ from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, dot, row
+from mjx_tt.pytrees import pytree
 from mjx_tt.sim.constant_acceleration import correct_covariance, predict_covariance
 
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
@@ -28,8 +27,7 @@ ROUNDS = 12  # of measurements, after which it is that of a filter that measures
 LONGEST = 10.0  # memories between measurements, of a filter that keeps a 20,000th of its lag
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class SensingParams:
     """The ball tracker: how it measures a position.
 
@@ -60,8 +58,7 @@ class SensingParams:
     jitter: Annotated[Scalars, Within(0.0, 0.1, "s")] | None = optional(0.0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Camera:
     """A camera's wrong calibration about the table frame's origin."""
 
@@ -106,8 +103,7 @@ def step_smoothing(
     return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Lag:
     """Estimate minus truth of a Kalman filter that assumes constant acceleration.
 
@@ -185,8 +181,7 @@ def jump(
     return jnp.stack([after[0] - before[0], after[1] - before[1], after[2] - before[2] + c.GRAVITY * dt])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Filters:
     """Memories of the tracker's filters of a ball; None for one that the parameters omit."""
 

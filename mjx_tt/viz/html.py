@@ -102,9 +102,9 @@ class Page:
         """Adds HTML to the section."""
         self.sections[-1].parts.append(Markup(html))
 
-    def paragraph(self, text: str, css: str = "") -> None:
+    def paragraph(self, text: str) -> None:
         """Adds plain text."""
-        self.add(Markup('<p class="{}">{}</p>' if css else "<p>{1}</p>").format(css, text))
+        self.add(Markup("<p>{}</p>").format(text))
 
     def embed(self, name: str, figure: Figure) -> str:
         """Source of an image that holds the figure, which is kept under its name."""

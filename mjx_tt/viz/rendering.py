@@ -112,7 +112,11 @@ class Moment:
 
     def __post_init__(self) -> None:
         for name, shape in {"qpos": (None,), "ball": (3,), "trail": (None, 3), "dots": (None, 3)}.items():
-            object.__setattr__(self, name, _checked_array(name, getattr(self, name), shape))
+            values = np.asarray(getattr(self, name), float)
+            if len(shape) != values.ndim or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
+                wanted = ", ".join("any" if n is None else str(n) for n in shape)
+                raise ValueError(f"{name} needs the shape ({wanted}), got {values.shape}")
+            object.__setattr__(self, name, values)
 
 
 def render_png(
@@ -337,12 +341,3 @@ def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
     return path
-
-
-def _checked_array(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
-    """values as float64; ValueError unless it has this shape, None standing for any length."""
-    values = np.asarray(values, float)
-    if values.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, values.shape, strict=True)):
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise ValueError(f"{name} needs the shape ({wanted}), got {values.shape}")
-    return values

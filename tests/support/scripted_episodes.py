@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from ballmodel.state import ball_state
 from mjx_tt.env.episode import Episodes, EpisodeState, Return
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
+from mjx_tt.pytrees import pytree
+from mjx_tt.robot import mjcf
 from mjx_tt.sim.model import LATENCIES, SimModel
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 P, TICKS = 8, 100  # episodes and control periods of most tests: one size, so that they share one compilation
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Script:
     """A controller that plays given actions (ticks, 8, P) and remembers what it was shown."""
 
@@ -32,6 +35,25 @@ class Script:
 
     def act(self, tick, state, observation):
         return self.actions[tick], observation
+
+
+@pytree
+class Overheard:
+    """A controller whose state also holds what it last saw and answered."""
+
+    inner: Any
+
+    @property
+    def mean(self):
+        return self.inner.mean
+
+    def start(self, observation):
+        action = jnp.zeros((observation.shape[0] - 3, *observation.shape[1:]))
+        return self.inner.start(observation), observation, action
+
+    def act(self, tick, state, observation):
+        action, after = self.inner.act(tick, state[0], observation)
+        return action, (after, observation, action)
 
 
 @dataclass(frozen=True)
@@ -99,6 +121,19 @@ def _player(task: Task, ticks: int):
         return *kept, last, back, evaluate_rewards(task.config.rewards, last, back)
 
     return jax.jit(play)
+
+
+def mujoco_path(velocities: np.ndarray) -> np.ndarray:
+    """Joint path (steps + 1, 8) of MuJoCo C from home under velocities (steps, 8)."""
+    model = mjcf.load_model()
+    data = mujoco.MjData(model)
+    path = [mjcf.home_qpos(model)]
+    data.qpos[:] = path[0]
+    for velocity in velocities:
+        data.ctrl[:] = velocity
+        mujoco.mj_step(model, data)
+        path.append(data.qpos.copy())
+    return np.array(path)
 
 
 def play(task: Task, episodes: Episodes, controller=None, ticks: int = TICKS) -> Record:

@@ -16,9 +16,9 @@ from experiments.evaluation.evaluate import Played
 from mjx_tt.env import reward_weights
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
+from mjx_tt.env.physics import OUT_OF_REACH
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import OUT_OF_REACH
 from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
 from tests.oracles import ball_flight
 

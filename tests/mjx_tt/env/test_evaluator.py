@@ -7,7 +7,6 @@ from dataclasses import fields, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
@@ -20,36 +19,22 @@ from mjx_tt.sim.model import LatencyParams, SimModel
 from tests.support.paths import ROOT
 
 TASK = TaskConfig(sim_rate=150.0)
+SHIPPED = ROOT / "experiments/shipped/policies/quickstart"
 N = 120
 
 
-@pytest.fixture(scope="module")
-def world():
-    """Lift, and nothing that is drawn anew for each episode."""
+def test_a_ball_keeps_its_spin_beside_others():
+    """Balls that spin one way in the first half of their order and another way in the second; and the first half.
+
+    In a world with lift, and nothing that is drawn anew for each episode.
+    """
     certain = {f"latency.{f.name}": 0.0 for f in fields(LatencyParams) if f.name.endswith("_std")}
-    return models.with_values(SimModel(), certain | {"sensing.ball_noise": 0.0, "ball.flight.magnus_coefficient": 1.0})
-
-
-@pytest.fixture(scope="module")
-def policy():
-    return load_policy(ROOT / "experiments/shipped/policies/quickstart")
-
-
-@pytest.fixture(scope="module")
-def pools(world):
-    """Balls that spin one way in the first half of their order and another way in the second; and the first half."""
+    lift = {"sensing.ball_noise": 0.0, "ball.flight.magnus_coefficient": 1.0}
+    world, policy = models.with_values(SimModel(), certain | lift), load_policy(SHIPPED)
     balls = sample_pool(jax.random.key(2), registry.resolve("player3/M0"), world.ball, N)
     spin = np.outer([1.0, 0.3, 0.0], np.where(np.arange(N) < N // 2, 40.0, -40.0))
     mixed = replace(balls, state=replace(balls.state, spin=jnp.asarray(spin, jnp.float32)))
-
-    def first(x):
-        return x[..., : N // 2] if x.ndim and x.shape[-1] == N else x
-
-    return mixed, jax.tree.map(first, mixed)
-
-
-def test_a_ball_keeps_its_spin_beside_others(world, policy, pools):
-    mixed, half = pools
+    half = jax.tree.map(lambda x: x[..., : N // 2] if x.ndim and x.shape[-1] == N else x, mixed)
     one = Evaluator(Simulator(TASK), mixed, world, ())
     other = one.on(half)
     key = jax.random.key(0)

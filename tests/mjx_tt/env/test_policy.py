@@ -11,7 +11,6 @@ import pytest
 
 from mjx_tt.env.policy import Policy, PolicyController
 from robot_io.contract import HISTORY, N_OBSERVATION, n_parameters
-from robot_io.policy.jax_policy import JitPolicy
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import forward
 
@@ -69,25 +68,3 @@ def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
         np.testing.assert_allclose(full[..., b], exact, rtol=0, atol=atol)
         robot = StreamingPolicy(one)
         np.testing.assert_allclose([robot.step(o) for o in observations[..., b]], exact, rtol=0, atol=1e-12)
-
-
-@pytest.fixture
-def control_process():
-    """Undoes what the compiled policy sets for the process that it runs in."""
-    yield
-    jax.config.update("jax_cpu_enable_async_dispatch", True)  # JAX's default
-
-
-def test_the_compiled_policy_of_the_control_loop_equals_the_streaming_one(control_process):
-    random = np.random.default_rng(3)
-    theta = 0.3 * random.standard_normal(n_parameters())
-    policy = Policy(theta, *random.standard_normal((2, N_OBSERVATION)))
-    compiled, streaming = JitPolicy(policy), StreamingPolicy(policy)
-    for _ in range(3):
-        compiled.reset()
-        streaming.reset()
-        for observation in random.standard_normal((20, N_OBSERVATION)):
-            np.testing.assert_allclose(compiled.step(observation), streaming.step(observation), rtol=0, atol=1e-5)
-    for wrong in (np.zeros(10), np.full(N_OBSERVATION, np.nan)):
-        with pytest.raises(ValueError, match="11 finite numbers"):
-            compiled.step(wrong)

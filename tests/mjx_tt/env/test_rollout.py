@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import unflatten
-from tests.support import scripted_episodes
+from tests.support.scripted_episodes import Overheard, play
 
 R, P = 6, 4
 MEAN = np.array([0.0, 0.5, 0.3, *[0.1] * 8], np.float32)
@@ -61,22 +59,6 @@ def result(run, theta, episodes):
     return jax.tree.map(np.asarray, run(theta, episodes))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Watched:
-    """A controller whose state also keeps what it was shown."""
-
-    inner: PolicyController
-    mean: jax.Array
-
-    def start(self, observation):
-        return self.inner.start(observation), observation
-
-    def act(self, tick, state, observation):
-        action, inner = self.inner.act(tick, state[0], observation)
-        return action, (inner, observation)
-
-
 def flat(x):
     """(..., R, P) -> (..., R x P), the batch of a rollout's block."""
     return x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x
@@ -85,8 +67,8 @@ def flat(x):
 @pytest.fixture(scope="module")
 def played(simulator, episodes, theta):
     """The same episodes tick by tick, all in one block."""
-    controller = Watched(PolicyController(unflatten(theta), MEAN, INVERSE_SCALE), MEAN)
-    return scripted_episodes.play(simulator.task, jax.tree.map(flat, episodes), controller, ticks=120)
+    controller = Overheard(PolicyController(unflatten(theta), MEAN, INVERSE_SCALE))
+    return play(simulator.task, jax.tree.map(flat, episodes), controller, ticks=120)
 
 
 def test_equals_the_same_episodes_played_tick_by_tick(result, played):

@@ -12,14 +12,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mjx_tt.env.physics import OUT_OF_REACH
 from mjx_tt.env.reward_weights import TERMS
-from mjx_tt.env.task import (
-    CONTRACT_OBSERVATIONS,
-    OUT_OF_REACH,
-    Task,
-    TaskConfig,
-    weigh_rewards,
-)
+from mjx_tt.env.task import CONTRACT_OBSERVATIONS, Task, TaskConfig, weigh_rewards
 from mjx_tt.env.terms import ObservationTerm
 from mjx_tt.robot import mjcf, robots
 from robot_io.contract import LIMITS, N_JOINTS
@@ -61,14 +56,9 @@ def serves(blade):
 
 @pytest.fixture(scope="module")
 def record(serves):
+    position, velocity = (np.transpose([getattr(s, x) for s in serves.values()]) for x in ("position", "velocity"))
     with jax.enable_x64(True):
-        return play(task(), batch(serves))
-
-
-def batch(serves):
-    return episodes(
-        np.transpose([s.position for s in serves.values()]), np.transpose([s.velocity for s in serves.values()])
-    )
+        return play(task(), episodes(position, velocity))
 
 
 def index(serves, name):
@@ -171,7 +161,12 @@ def test_reward_terms_of_a_still_robot_by_hand(serves, record, blade):
 def flailing():
     """A robot that is pushed around hard, with a ball that hangs in the air."""
     with jax.enable_x64(True):
-        return play(task(), episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0)), script(pushed()))
+        return play(task(), hanging(), script(pushed()))
+
+
+def hanging(p=P, **simulation):
+    """Episodes with a ball that hangs in the air."""
+    return episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0, **simulation), p=p)
 
 
 def pushed() -> np.ndarray:
@@ -202,50 +197,39 @@ def test_motion_terms_equal_a_recount_of_the_commands(flailing):
     assert 0 < safe.min() < safe.max() <= 1
 
 
-def test_pose_terms_equal_a_recount_in_mujoco(flailing):
-    """Steps in contact, with a low blade and with a blade that looks aside, by MuJoCo's poses and distances."""
-    mj = mjcf.load_model()
+@pytest.fixture(scope="module")
+def recounted(flailing):
+    """By MuJoCo's poses and distances: periods (3, TICKS, P) in contact, with a low blade, with a blade aside."""
+    mj, watched = mjcf.load_model(), robots.paper().file
     data, site = mujoco.MjData(mj), mj.site(mjcf.PADDLE_SITE).id
-    watched = robots.paper().file
-    own = list(watched.pairs)
-    table = [(name, "col_table") for name in watched.table]
-    low_pairs = [(name, "col_table") for name in watched.blade]
 
     def gap(pairs):
         return min(mujoco.mj_geomDistance(mj, data, mj.geom(a).id, mj.geom(b).id, 1.0, None) for a, b in pairs)
 
-    counts = np.zeros((3, P))
-    for tick in range(TICKS):
-        for i in range(P):
-            data.qpos[:] = flailing.qpos[tick, :, i]
-            mujoco.mj_kinematics(mj, data)
-            counts[:, i] += gap(own + table) <= 0, gap(low_pairs) < 0.05, data.site_xmat[site, 5] < 0.3
-    for name, count in zip(("collision", "paddle_height", "style"), counts, strict=True):
+    table, low = ([(name, "col_table") for name in names] for names in (watched.table, watched.blade))
+    found = np.zeros((3, TICKS, P), bool)
+    for tick, i in np.ndindex(TICKS, P):
+        data.qpos[:] = flailing.qpos[tick, :, i]
+        mujoco.mj_kinematics(mj, data)
+        found[:, tick, i] = gap([*watched.pairs, *table]) <= 0, gap(low) < 0.05, data.site_xmat[site, 5] < 0.3
+    return found
+
+
+def test_pose_terms_equal_a_recount_in_mujoco(flailing, recounted):
+    for name, count in zip(("collision", "paddle_height", "style"), recounted.sum(axis=1), strict=True):
         assert 0 < count.sum() < TICKS * P  # the flailing robot does all of it, but not all the time
         np.testing.assert_array_equal(flailing.terms[TERMS.index(name)], -count, err_msg=name)
 
 
-def test_a_contact_ends_the_episode_where_it_is_asked_for(flailing):
+def test_a_contact_ends_the_episode_where_it_is_asked_for(flailing, recounted):
     """The first period after which MuJoCo finds the robot in contact; until then nothing differs."""
-    mj = mjcf.load_model()
-    data, watched = mujoco.MjData(mj), robots.paper().file
-    pairs = [(mj.geom(a).id, mj.geom(b).id) for a, b in [*watched.pairs, *((a, "col_table") for a in watched.table)]]
     with jax.enable_x64(True):
         ends = Task(replace(task().config, contact_ends_episode=True))
-        stopped = play(
-            ends, episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0)), script(pushed())
-        )
-    alive = np.ones((TICKS, P), bool)
-    for i in range(P):
-        for tick in range(TICKS):
-            data.qpos[:] = flailing.qpos[tick, :, i]
-            mujoco.mj_kinematics(mj, data)
-            if min(mujoco.mj_geomDistance(mj, data, a, b, 1.0, None) for a, b in pairs) <= 0:
-                alive[tick:, i] = False
-                break
-    assert flailing.live.all() and 0 < (~alive).any(axis=0).sum()
-    np.testing.assert_array_equal(stopped.live, alive)
-    np.testing.assert_array_equal(stopped.terms[TERMS.index("collision")], -(~alive).any(axis=0).astype(float))
+        stopped = play(ends, hanging(), script(pushed()))
+    touched = np.logical_or.accumulate(recounted[0], axis=0)
+    assert flailing.live.all() and touched.any()
+    np.testing.assert_array_equal(stopped.live, ~touched)
+    np.testing.assert_array_equal(stopped.terms[TERMS.index("collision")], -touched.any(axis=0).astype(float))
 
 
 def test_commands_keep_the_kinematic_limits(flailing):
@@ -260,12 +244,11 @@ def test_a_further_observation_term_follows_the_contracts_rows():
     further = (*CONTRACT_OBSERVATIONS, ObservationTerm("last_command", lambda sensed: sensed.command, 0.5))
     config = TaskConfig(sim_rate=75.0, observations=further)
     assert config.n_observation == 19
-    hanging = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(), p=2)
-    each, command = Task(config), np.random.default_rng(0).normal(size=(N_JOINTS, 2))
-    state = each.reset(hanging, Script(jnp.zeros((1, N_JOINTS, 2)), jnp.zeros(19)))
+    each, balls, command = Task(config), hanging(p=2), np.random.default_rng(0).normal(size=(N_JOINTS, 2))
+    state = each.reset(balls, Script(jnp.zeros((1, N_JOINTS, 2)), jnp.zeros(19)))
     np.testing.assert_array_equal(state.controller[11:], 0.0)  # nothing was commanded before the first step
     state = replace(state, command=jnp.asarray(command, jnp.float32))
-    seen = each.observe(1, state, hanging, each.prepare(hanging))
+    seen = each.observe(1, state, balls, each.prepare(balls))
     np.testing.assert_allclose(seen[:3], [[0.0] * 2, [1.0] * 2, [0.5] * 2], atol=1e-6)
     np.testing.assert_allclose(seen[3:11], np.broadcast_to(each.home[:, None], (N_JOINTS, 2)), atol=1e-6)
     np.testing.assert_allclose(seen[11:], 0.5 * command, rtol=1e-6)
@@ -273,11 +256,11 @@ def test_a_further_observation_term_follows_the_contracts_rows():
 
 def test_ball_noise_is_two_diameters_wide_and_the_joints_have_none(flailing):
     """Noise of +-40 mm on each coordinate of the ball plus the tracker's offset, new at every step."""
-    simulation = model(gravity=0.0, ball_noise=0.04)
-    offset = replace(simulation.sensing, ball_offset_x=0.01, ball_offset_y=-0.02, ball_offset_z=0.03)
+    offset = {"ball_offset_x": 0.01, "ball_offset_y": -0.02, "ball_offset_z": 0.03}
     with jax.enable_x64(True):
-        hanging = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=replace(simulation, sensing=offset))
-        seen = play(task(), hanging).controller
+        balls = hanging(ball_noise=0.04)
+        sensing = replace(balls.model.sensing, **{name: jnp.full(P, value) for name, value in offset.items()})
+        seen = play(task(), replace(balls, model=replace(balls.model, sensing=sensing))).controller
     noise = seen[:, :3] - np.array([0.0, 1.0, 0.5])[:, None] - np.array([0.01, -0.02, 0.03])[:, None]
     assert (np.abs(noise) < 0.04).all()
     assert stats.kstest(noise.ravel(), "uniform", (-0.04, 0.08)).pvalue > 1e-3

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -21,37 +20,10 @@ from mjx_tt.sim.model import SimModel
 from robot_io import contract
 from robot_io.policy import artefact, export
 from robot_io.policy.jax_policy import Policy
+from tests.support.scripted_episodes import Overheard
 
 OTHERS = [name for name in robots.names() if name != robots.DEFAULT]
 TICKS = 60
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Overheard:
-    """A controller whose state also holds what it last saw and answered."""
-
-    inner: Any
-
-    @property
-    def mean(self):
-        return self.inner.mean
-
-    def start(self, observation):
-        action = jnp.zeros((observation.shape[0] - 3, *observation.shape[1:]))
-        return self.inner.start(observation), observation, action
-
-    def act(self, tick, state, observation):
-        action, after = self.inner.act(tick, state[0], observation)
-        return action, (after, observation, action)
-
-
-def a_policy(robot, seed=0):
-    joints = robot.contract.n_joints
-    theta = np.asarray(initial_theta(jax.random.key(seed), 0.3, contract.n_parameters(joints)))
-    rng = np.random.default_rng(seed)
-    mean = np.concatenate([[0.3, -0.5, 0.3], robot.home]).astype(np.float32)
-    return Policy(theta, mean, rng.uniform(1.0, 3.0, 3 + joints).astype(np.float32))
 
 
 @pytest.fixture(scope="module", params=OTHERS)
@@ -61,7 +33,10 @@ def played(request):
     simulator = Simulator(TaskConfig(robot=robot))
     model = SimModel(joints=robot.contract.joints)
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 64)
-    policy = a_policy(robot)
+    joints, rng = robot.contract.n_joints, np.random.default_rng(0)
+    theta = np.asarray(initial_theta(jax.random.key(0), 0.3, contract.n_parameters(joints)))
+    mean = np.concatenate([[0.3, -0.5, 0.3], robot.home]).astype(np.float32)
+    policy = Policy(theta, mean, rng.uniform(1.0, 3.0, 3 + joints).astype(np.float32))
 
     @jax.jit
     def play(policy, pool):

@@ -80,53 +80,42 @@ def test_a_term_that_is_no_number_is_masked_and_counted(policy):
 GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, reward_term\n"
 
 
+def reward(body: str = "return 0.0", name: str = "'x'") -> str:
+    return f"@reward_term({name})\ndef f(step):\n    {body}\n"
+
+
+def observation(body: str, name: str = "x") -> str:
+    return f"@observation_term({name!r})\ndef f(sensed):\n    return {body}\n"
+
+
+def a_network(shape: tuple[int, int], step: str) -> str:
+    functions = f"    start = staticmethod(lambda p, x: ())\n    step = staticmethod(lambda p, s, x: {step})\n"
+    return f"@network('n', shapes={{'w': {shape}}})\nclass N:\n{functions}"
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("def f(:\n", r"line 1: invalid syntax"),
-        (GOOD + "import nothing_of_that_name\n", r"line 3: ModuleNotFoundError: No module named 'nothing_of"),
-        (GOOD, "defines nothing"),
-        (
-            GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n",
-            "'style': the name is one of the package's own",
-        ),
-        (GOOD + "@reward_term('a b')\ndef f(step):\n    return 0.0\n", "must be letters, digits"),
-        (GOOD + "@reward_term('x', per='day')\ndef f(step):\n    return 0.0\n", "per is 'day', allowed: step, ball"),
-        (GOOD + "@reward_term('x', reduce='max')\ndef f(step):\n    return 0.0\n", "'max', allowed: mean, one_minus"),
-        (
-            GOOD + "".join(f"@reward_term('x')\ndef {name}(step):\n    return 0.0\n" for name in "fg"),
-            "'x': defined twice",
-        ),
-        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.bal\n", "line 5: AttributeError: .*bal"),
-        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.ball[0]\n", "rows of numbers"),
-        (GOOD + "@observation_term('ball_x')\ndef f(sensed):\n    return sensed.ball\n", "the package's own"),
-        (GOOD + "@reward_term('x')\ndef f(step):\n    return step.comand\n", "line 5: AttributeError: .*comand"),
-        (GOOD + "@reward_term('x')\ndef f(step):\n    return step.command\n", r"returns an array \(8, 2, 3\)"),
-        (
-            GOOD + "@reward_term('x')\ndef f(step):\n    return 1 if step.bounced else 0\n",
-            "line 5: The truth value",
-        ),
-        (GOOD + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    pass\n", "has no start and no step"),
-        (
-            GOOD
-            + "@network('n', shapes={'w': (7, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
-            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, s))\n",
-            r"returns an action \(7,\), \(8,\) is wanted",
-        ),
-        (
-            GOOD
-            + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
-            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, x))\n",
-            "another kind of state",
-        ),
-        (
-            GOOD
-            + "@network('n', shapes={'w': (8, 0)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
-            + "    step = staticmethod(lambda p, s, x: (x, s))\n",
-            "positive whole numbers",
-        ),
+        ("import nothing_of_that_name\n", r"line 3: ModuleNotFoundError: No module named 'nothing_of"),
+        ("def f(:\n", r"line 3: invalid syntax"),
+        ("", "defines nothing"),
+        (reward(name="'style'"), "'style': the name is one of the package's own"),
+        (reward(name="'a b'"), "must be letters, digits"),
+        (reward(name="'x', per='day'"), "per is 'day', allowed: step, ball"),
+        (reward(name="'x', reduce='max'"), "'max', allowed: mean, one_minus"),
+        (reward() + reward().replace("def f", "def g"), "'x': defined twice"),
+        (reward("return step.comand"), "line 5: AttributeError: .*comand"),
+        (reward("return step.command"), r"returns an array \(8, 2, 3\)"),
+        (reward("return 1 if step.bounced else 0"), "line 5: The truth value"),
+        (observation("sensed.bal"), "line 5: AttributeError: .*bal"),
+        (observation("sensed.ball[0]"), "rows of numbers"),
+        (observation("sensed.ball", "ball_x"), "the package's own"),
+        ("@network('n', shapes={'w': (8, 11)})\nclass N:\n    pass\n", "has no start and no step"),
+        (a_network((7, 11), "(p['w'] @ x, s)"), r"returns an action \(7,\), \(8,\) is wanted"),
+        (a_network((8, 11), "(p['w'] @ x, x)"), "another kind of state"),
+        (a_network((8, 0), "(x, s)"), "positive whole numbers"),
     ],
 )
 def test_a_mistake_in_the_file_is_named(text, says):
     with pytest.raises(ValueError, match=f"(?s)my.py.*{says}"):
-        user_defined.load(text, "my.py").checked_network("n", 11)
+        user_defined.load(GOOD + text, "my.py").checked_network("n", 11)

@@ -12,7 +12,7 @@ from ballmodel import constants as c
 from ballmodel.flight import PaddlePose, ball_params
 from ballmodel.state import ball_state
 from mjx_tt.gradient.incoming import Incoming
-from mjx_tt.gradient.strike import Meeting, find_landing, simulate_strike
+from mjx_tt.gradient.strike import Meeting, Strike, find_landing, simulate_strike
 
 STEP = 1 / 150
 AIRLESS = replace(ball_params(), flight=replace(ball_params().flight, air_density=0.0))
@@ -30,10 +30,12 @@ def test_without_air_a_ball_lands_where_its_parabola_does():
     assert found.crossed.all() and found.down.all()
 
 
-def still_blade(position) -> PaddlePose:
-    """At rest, its normal along y."""
-    column = jnp.asarray(position, jnp.float32)[:, None]
-    return PaddlePose(column, jnp.array([[0.0], [1.0], [0.0]]), jnp.zeros((3, 1)), jnp.zeros((3, 1)))
+def strike(ball: Incoming, position: list[float], hit: bool) -> Strike:
+    """Of a blade at rest there, its normal along y."""
+    column, rest = jnp.array(position)[:, None], jnp.zeros((3, 1))
+    blade = PaddlePose(column, jnp.array([[0.0], [1.0], [0.0]]), rest, rest)
+    met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([hit]))
+    return simulate_strike(met, ball, AIRLESS, (blade, blade), STEP)
 
 
 def passing(height: float) -> Incoming:
@@ -47,9 +49,7 @@ def passing(height: float) -> Incoming:
 
 @pytest.mark.parametrize("above", [0.1, 0.25])
 def test_a_missed_ball_is_as_far_as_its_line_passes_the_blade(above):
-    met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([False]))
-    blade = still_blade([0.0, 0.0, 0.0])
-    struck = simulate_strike(met, passing(above), AIRLESS, (blade, blade), STEP)
+    struck = strike(passing(above), [0.0, 0.0, 0.0], hit=False)
     np.testing.assert_allclose(np.sqrt(struck.distance), above, atol=2e-4)
     # Struck at the blade's middle it would have come straight back, slower by the rubber's restitution.
     np.testing.assert_allclose(struck.ball.velocity[[0, 2], 0], 0.0, atol=1e-5)
@@ -58,9 +58,6 @@ def test_a_missed_ball_is_as_far_as_its_line_passes_the_blade(above):
 
 
 def test_a_hit_counts_from_the_blade_s_middle_in_its_plane():
-    met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([True]))
-    blade = still_blade([0.03, 0.0, 0.0])
-    ball = passing(0.04)
-    struck = simulate_strike(met, ball, AIRLESS, (blade, blade), STEP)
+    struck = strike(passing(0.04), [0.03, 0.0, 0.0], hit=True)
     np.testing.assert_allclose(np.sqrt(struck.distance), 0.05, atol=5e-4)
     assert float(struck.ball.velocity[1, 0]) > 2.5

@@ -9,6 +9,7 @@ import pytest
 import scipy.special
 
 from mjx_tt.lanes.emitter import Unsupported
+from mjx_tt.lanes.functions import sin_cos
 from mjx_tt.lanes.loop import _by_lanes
 
 L = 37  # two vectors and a part of one
@@ -40,63 +41,45 @@ U = np.random.default_rng(4).integers(0, 2**32, L, dtype=np.uint32)
 T = np.random.default_rng(5).integers(0, 2, L).astype(bool)
 
 
+COMPARISONS = (jnp.equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
+FLOATS = (
+    *(jnp.negative, jnp.abs, jnp.sign, jnp.sqrt, jnp.floor, jnp.ceil, jnp.round, jnp.isfinite, jnp.square),
+    lambda x: jnp.minimum(x, 1.0),
+    lambda x: jnp.maximum(0.5, x),
+    lambda x: jnp.clip(x, -1.0, 2.0),
+    lambda x: x**3,
+    lambda x: x**-2,
+    lambda x: x.astype(bool),
+    lambda x: jax.lax.bitcast_convert_type(x, jnp.int32),
+)
+WHOLE = (
+    *(jnp.invert, jnp.abs),
+    lambda x: x % 7,
+    lambda x: x // 7,
+    lambda x: jax.lax.rem(x, jnp.int32(7)),
+    lambda x: x >> 3,
+    lambda x: x.astype(jnp.float32),
+    lambda x: x.astype(jnp.uint32),
+)
+UNSIGNED = (lambda x: x >> 3, lambda x: x << 5, lambda x: x ^ 0x5555, lambda x: x.astype(jnp.float32))
+FLAGS = (jnp.logical_not, lambda x: x.astype(jnp.float32), lambda x: x.astype(jnp.int32))
+
+
 @pytest.mark.parametrize(
     "function, arrays",
     [
-        (jnp.add, (A, B)),
-        (jnp.subtract, (A, B)),
-        (jnp.multiply, (A, B)),
-        (jnp.divide, (A, B)),
-        (jnp.minimum, (A, B)),
-        (jnp.maximum, (A, B)),
-        (lambda x: jnp.minimum(x, 1.0), (A,)),
-        (lambda x: jnp.maximum(0.5, x), (A,)),
-        (lambda x: jnp.clip(x, -1.0, 2.0), (A,)),
-        (jnp.negative, (A,)),
-        (jnp.abs, (A,)),
-        (jnp.sign, (A,)),
-        (jnp.sqrt, (A,)),
-        (jnp.floor, (A,)),
-        (jnp.ceil, (A,)),
-        (jnp.round, (A,)),
-        (jnp.isfinite, (A,)),
-        (jnp.square, (A,)),
-        (lambda x: x**3, (A,)),
-        (lambda x: x**-2, (A,)),
-        (jnp.equal, (A, B)),
+        *((f, (A, B)) for f in (jnp.add, jnp.subtract, jnp.multiply, jnp.divide, jnp.minimum, jnp.maximum)),
+        *((f, (A, B)) for f in COMPARISONS),
+        *((f, (A,)) for f in FLOATS),
+        *((f, (K, J)) for f in (jnp.add, jnp.minimum, jnp.less, jnp.bitwise_and, jnp.bitwise_or)),
+        *((f, (K,)) for f in WHOLE),
+        *((f, (U, U[::-1])) for f in (jnp.multiply, jnp.maximum, jnp.less)),
+        *((f, (U,)) for f in UNSIGNED),
+        *((f, (T,)) for f in FLAGS),
         (jnp.not_equal, (A, A)),
-        (jnp.less, (A, B)),
-        (jnp.less_equal, (A, B)),
-        (jnp.greater, (A, B)),
-        (jnp.greater_equal, (A, B)),
         (jnp.where, (T, A, B)),
-        (jnp.add, (K, J)),
-        (jnp.multiply, (U, U)),
-        (lambda x: x % 7, (K,)),
-        (lambda x: x // 7, (K,)),
-        (lambda x: jax.lax.rem(x, jnp.int32(7)), (K,)),
-        (lambda x: x >> 3, (K,)),
-        (lambda x: x >> 3, (U,)),
-        (lambda x: x << 5, (U,)),
-        (lambda x: x ^ 0x5555, (U,)),
-        (jnp.bitwise_and, (K, J)),
-        (jnp.bitwise_or, (K, J)),
-        (jnp.invert, (K,)),
-        (jnp.minimum, (K, J)),
-        (jnp.maximum, (U, U[::-1])),
-        (jnp.less, (K, J)),
-        (jnp.less, (U, U[::-1])),
-        (jnp.abs, (K,)),
         (jnp.logical_and, (T, T[::-1])),
-        (jnp.logical_not, (T,)),
-        (lambda x: x.astype(jnp.float32), (K,)),
-        (lambda x: x.astype(jnp.float32), (U,)),
-        (lambda x: x.astype(jnp.float32), (T,)),
-        (lambda x: x.astype(jnp.int32), (T,)),
         (lambda x: x.astype(jnp.int32), (numbers(odd=False),)),
-        (lambda x: x.astype(bool), (A,)),
-        (lambda x: x.astype(jnp.uint32), (K,)),
-        (lambda x: jax.lax.bitcast_convert_type(x, jnp.int32), (A,)),
     ],
 )
 def test_an_operation_gives_the_same_bits(function, arrays):
@@ -123,6 +106,18 @@ def test_a_function_is_right_to_some_units_of_the_last_place(function, oracle, l
     wanted = oracle(x.astype(np.float64))
     error = np.abs(by_lanes(function, x) - wanted) / np.spacing(np.abs(wanted).astype(np.float32))
     assert error.max() < units
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("largest", [np.pi, 8000.0])
+def test_sine_and_cosine_are_exact_to_rounding(dtype, largest):
+    angles = np.random.default_rng(2).uniform(-largest, largest, 100_000).astype(dtype)
+    angles[:9] = np.arange(-4, 5) * np.pi / 2
+    with jax.enable_x64(dtype == np.float64):
+        sin, cos = jax.jit(sin_cos)(angles)
+    assert sin.dtype == cos.dtype == dtype
+    for found, exact in ((sin, np.sin(angles.astype(float))), (cos, np.cos(angles.astype(float)))):
+        np.testing.assert_allclose(found, exact, rtol=0, atol=np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize(

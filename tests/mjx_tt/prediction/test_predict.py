@@ -45,13 +45,18 @@ def told(scatter: float = 1e-3) -> Belief:
     return Belief(with_values(SimModel(), LIFT), SpinPrior(MEAN, SPREAD), np.full(3, scatter))
 
 
+def ahead(tracks, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """Places (3, 1, n) and covariances at the sample 0.45 s after the first, from the first 0.15 s."""
+    fitted = fit_states([t.part(0, 19) for t in tracks], belief)
+    flown, covariance = fly_on(fitted, np.full((1, len(tracks)), 56 * INTERVAL))
+    return flown.position[:, 1:, 0], covariance
+
+
 def test_predictions_miss_by_what_their_covariances_say():
     """From 0.15 s on, 0.3 s ahead: squared errors in units of the covariance follow chi square of three."""
     tracks, truth, _ = spinning()
-    flown, covariance = fly_on(
-        fit_states([t.part(0, 19) for t in tracks], told()), np.full((1, len(tracks)), 56 * INTERVAL)
-    )
-    off = truth[:, 56:57] - flown.position[:, 1:, 0]
+    places, covariance = ahead(tracks, told())
+    off = truth[:, 56:57] - places
     place = covariance - SIGMA**2 * np.eye(3)  # the truth is no sample
     squares = squared_miss(off, place)
     assert 0.8 < np.nanmedian(squares) / 2.37 < 1.5  # median of chi square with three degrees
@@ -64,10 +69,8 @@ def test_regions_hold_what_they_promise_though_the_model_is_wrong():
     wrong = with_values(SimModel(), LIFT | {"ball.flight.drag_coefficient": 0.7})
     belief = learn(tracks[::2], wrong, 0.15, (0.3,))
     held = [t for t in tracks[1::2] if len(t) > 56]
-    flown, covariance = fly_on(
-        fit_states([t.part(0, 19) for t in held], belief), np.full((1, len(held)), 56 * INTERVAL)
-    )
-    off = np.stack([t.position[:, 56] for t in held], axis=1)[:, None] - flown.position[:, 1:, 0]
+    places, covariance = ahead(held, belief)
+    off = np.stack([t.position[:, 56] for t in held], axis=1)[:, None] - places
     inside = squared_miss(off, covariance) < 6.25  # 90 % of chi square with three degrees
     assert 0.75 < inside.mean() <= 1.0
     plain = squared_miss(off, covariance / np.interp(0.3, *belief.wider)) < 6.25

@@ -41,6 +41,7 @@ WALL = with_values(
         "ball.flight.drag_coefficient": 0.1,
     },
 )
+EVERYTHING = Box(np.full(8, -99.0, np.float32), np.full(8, 99.0, np.float32))
 STILL = np.zeros((n_parameters(), LANES), np.float32)
 NORMALISER = (np.zeros(N_OBSERVATION, np.float32), np.ones(N_OBSERVATION, np.float32))
 
@@ -77,7 +78,7 @@ def stacked(**changes):
     return human_player.stack([player] * LANES)
 
 
-def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=None, key=0):
+def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=EVERYTHING, start=None, key=0):
     """One turn from hand-made balls [(position, velocity), ...], repeated over the lanes."""
     position, velocity = (jnp.asarray([balls[i % len(balls)][k] for i in range(LANES)], jnp.float32).T for k in (0, 1))
     home = jnp.repeat(jnp.asarray(simulator.task.home, jnp.float32)[:, None], LANES, axis=1)
@@ -88,9 +89,8 @@ def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=N
         start=home if start is None else start,
         dummy=jnp.zeros(LANES, bool),
     )
-    everything = Box(np.full(8, -99.0, np.float32), np.full(8, 99.0, np.float32)) if box is None else box
     state, result = simulator.shots(
-        Policy(theta, *NORMALISER), stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
+        Policy(theta, *NORMALISER), stacked(), without_nominal(spread(model)), state, jax.random.key(key), box
     )
     return state, jax.tree.map(np.asarray, result)
 
@@ -179,9 +179,7 @@ def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
     assert result.fault.any()
     assert np.all(result.outcome[result.fault] == MISSED)
     assert np.all(result.terms[3][result.fault] == -2.0) and np.all(result.terms[3][~result.fault] == 0.0)
-    played = simulator.play(
-        Policy(theta, *NORMALISER), stacked(), spread(EXACT), jax.random.key(0), 6, max_touches=20, capacity=64
-    )
+    played = simulator.play(Policy(theta, *NORMALISER), stacked(), spread(EXACT), jax.random.key(0), 6, max_touches=20)
     end, length = np.asarray(played.end), np.asarray(played.length)
     dummy = (end == End.DUMMY_BY_HAND) | (end == End.DUMMY_WITH_PADDLE)
     assert (
@@ -193,27 +191,24 @@ def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
     assert set(end[:-1][dummy[1:]]) == {End.ROBOT_MISSED}  # also where the ball was a service, or into the net
 
 
-@pytest.fixture(scope="module")
-def rallies(simulator):
-    result = simulator.play(
-        Policy(STILL, *NORMALISER), stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
-    )
-    return jax.tree.map(np.asarray, result)
-
-
-def test_touches_are_those_of_the_logged_hits(rallies):
-    """A rally's length, counted again from the log: each ball is one touch, each that the robot hit another."""
-    assert rallies.length.max() >= 5  # the wall rallies
+def test_rallies_are_the_turns_played_one_by_one(simulator):
+    """A rally's length, counted again: each ball is one touch, each that the robot hit another."""
+    policy, player, world, key = Policy(STILL, *NORMALISER), stacked(), without_nominal(spread(WALL)), jax.random.key(5)
+    played = jax.tree.map(np.asarray, simulator.play(policy, player, world, key, 6, EVERYTHING))
+    assert played.length.max() >= 5  # the wall rallies
+    start_key, key = jax.random.split(key)
+    state, lengths, ends = simulator.start(player, world, start_key, LANES), [], []
+    for turn in range(played.length.sum(axis=0).max()):
+        state, shot = simulator.shots(
+            policy, player, world, state, jax.random.split(jax.random.fold_in(key, turn))[0], EVERYTHING
+        )
+        lengths.append(1 + (np.asarray(shot.outcome) != MISSED))
+        ends.append(np.asarray(shot.end))
     for lane in range(LANES):
-        count = rallies.balls.count[lane]
-        assert count <= 64
-        rally, touch, hit = (getattr(rallies.balls, name)[:count, lane] for name in ("rally", "touch", "hit"))
-        for k in range(6):
-            mine = rally == k
-            assert rallies.length[k, lane] == mine.sum() + hit[mine].sum()
-            np.testing.assert_array_equal(touch[mine], 1 + 2 * np.arange(mine.sum()))
-            returned = rallies.balls.returned[:count, lane][mine]
-            assert np.all(returned[:-1])  # only what was returned went on
+        end, touches = np.array(ends)[:, lane], np.cumsum([length[lane] for length in lengths])
+        over = np.flatnonzero(end != End.NONE)[:6]
+        np.testing.assert_array_equal(played.end[:, lane], end[over])
+        np.testing.assert_array_equal(played.length[:, lane], np.diff(touches[over], prepend=0))
 
 
 def test_players_meet_the_return_where_finer_steps_have_it():

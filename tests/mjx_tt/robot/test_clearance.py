@@ -11,15 +11,13 @@ import pytest
 
 from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.chain import chain_from_model
-from mjx_tt.robot.clearance import (
-    BISECTIONS,
-    CapsuleClearance,
-)
+from mjx_tt.robot.clearance import BISECTIONS, CapsuleClearance
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 
 N = 4000
-RADIUS = {c.name: c.radius for c in mjcf.capsules(mjcf.load_model())}
+MODEL = mjcf.load_model()
+RADIUS = {c.name: c.radius for c in mjcf.capsules(MODEL)}
 WATCHED = robots.paper().file
 PAIRS = {frozenset(pair) for pair in WATCHED.pairs}
 
@@ -44,12 +42,7 @@ LEFT_OUT = {
 
 
 @pytest.fixture(scope="module")
-def model():
-    return mjcf.load_model()
-
-
-@pytest.fixture(scope="module")
-def poses(model):
+def poses():
     """Joint positions (8, N) within the limits: half anywhere, half near the table's edge where both signs occur."""
     rng = np.random.default_rng(0)
     q = rng.uniform(np.array(LIMITS.lower)[:, None], np.array(LIMITS.upper)[:, None], (8, N))
@@ -59,23 +52,23 @@ def poses(model):
 
 
 @pytest.fixture(scope="module")
-def mujocos(model, poses):
+def mujocos(poses):
     """MuJoCo's signed distance (N,) of every pair of collision geoms by the set of their names, and whether the axis of
     a capsule passes through the table, by its name."""
-    names = [c.name for c in mjcf.capsules(model)] + ["col_table"]
-    geoms = {name: model.geom(name).id for name in names}
+    names = [*RADIUS, "col_table"]
+    geoms = {name: MODEL.geom(name).id for name in names}
     distances = {frozenset(pair): np.empty(N) for pair in combinations(names, 2)}
     pierced = {name: np.empty(N, bool) for name in WATCHED.table}
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(MODEL)
     for i in range(N):
         data.qpos[:] = poses[:, i]
-        mujoco.mj_kinematics(model, data)
+        mujoco.mj_kinematics(MODEL, data)
         for (a, b), values in distances.items():
-            values[i] = mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 5.0, None)
+            values[i] = mujoco.mj_geomDistance(MODEL, data, geoms[a], geoms[b], 5.0, None)
         for name, values in pierced.items():
             geom = data.geom(name)
-            half = geom.xmat.reshape(3, 3)[:, 2] * model.geom(name).size[1]
-            values[i] = meets_box(geom.xpos - half, 2 * half, data.geom("col_table").xpos, model.geom("col_table").size)
+            half = geom.xmat.reshape(3, 3)[:, 2] * MODEL.geom(name).size[1]
+            values[i] = meets_box(geom.xpos - half, 2 * half, data.geom("col_table").xpos, MODEL.geom("col_table").size)
     return distances, pierced
 
 
@@ -92,9 +85,9 @@ def distances(mujocos):
 
 
 @pytest.fixture(scope="module")
-def clearances(model, poses):
-    kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
-    clearance = CapsuleClearance(kinematics, mjcf.capsules(model), WATCHED)
+def clearances(poses):
+    kinematics = PaddleKinematics(chain_from_model(MODEL), mjcf.paddle_frame(MODEL))
+    clearance = CapsuleClearance(kinematics, mjcf.capsules(MODEL), WATCHED)
     q = poses.astype(np.float32)
     return jax.tree.map(np.asarray, jax.jit(lambda q: clearance(kinematics.links(q), q[0]))(q))
 

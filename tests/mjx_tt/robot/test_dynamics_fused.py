@@ -100,9 +100,3 @@ def test_fluid_forces_are_refused_by_both_engines(option):
     for build in (lambda: FusedEngine(chain_from_model(model)), lambda: MjxEngine(model)):
         with pytest.raises(ValueError, match=f"option {option}: must be 0"):
             build()
-
-
-def test_the_robot_has_no_fluid():
-    model = mjcf.load_model()
-    assert model.opt.density == 0 and model.opt.viscosity == 0 and not model.opt.wind.any()
-    assert not model.geom_fluid.any()

@@ -99,7 +99,12 @@ MISTAKES = {
         'joint="elbow" forcerange="-1 1" kv',
         ["elbow: forcelimited", "remove forcerange"],
     ),
-    "air": (MJCF, "  <default>\n", '  <option density="1.2"/>\n  <default>\n', ["option density: is 1.2", "remove it"]),
+    "air": (
+        MJCF,
+        "  <default>\n",
+        '  <option density="1.2"/>\n  <default>\n',
+        ["option density: must be 0", "got 1.2; remove it"],
+    ),
     "a ball of its own": (MJCF, '<body name="carriage"', '<body name="ball"', ["cannot stand", "ball", "rename it"]),
     "tied joints": (
         MJCF,

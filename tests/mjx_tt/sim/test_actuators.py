@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 
 from mjx_tt.robot import mjcf
 from mjx_tt.sim import actuators, model
-from mjx_tt.sim.actuators import Drives, JointDrive
+from mjx_tt.sim.actuators import JointDrive
 from robot_io.contract import JOINT_NAMES, N_JOINTS
 from tests.support import scripted_episodes
-from tests.support.scripted_episodes import episodes, script, task
+from tests.support.scripted_episodes import episodes, mujoco_path, script, task
 
 T, SUBSTEPS = 1 / 75, 4
 H = T / SUBSTEPS
@@ -109,19 +109,6 @@ def mean_velocities(command):
     return np.array(means)
 
 
-def mujoco_path(velocities):
-    """Joint path (steps + 1, 8) of MuJoCo C under velocities (steps, 8)."""
-    mj = mjcf.load_model()
-    data = mujoco.MjData(mj)
-    data.qpos[:] = mjcf.home_qpos(mj)
-    path = [data.qpos.copy()]
-    for velocity in velocities:
-        data.ctrl[:] = velocity
-        mujoco.mj_step(mj, data)
-        path.append(data.qpos.copy())
-    return np.array(path)
-
-
 def simulation():
     """The nominal model without noise and gravity, with drives that differ between the episodes."""
     changed = {name for case in CASES for name in case}
@@ -161,8 +148,8 @@ def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
             np.testing.assert_allclose(record.paddle[tick, :, i], paddle, atol=1e-5, err_msg=str(case))
 
 
-def effects(**values) -> Drives:
-    return Drives(**{name: values.get(name) for name in actuators.EFFECTS})
+def effects(**values) -> JointDrive:
+    return JointDrive(**{name: values.get(name) for name in actuators.EFFECTS})
 
 
 @pytest.mark.parametrize(

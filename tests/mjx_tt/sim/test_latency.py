@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import mjcf
 from mjx_tt.sim import latency
 from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import FESTO_JOINTS, N_JOINTS
-from tests.support import scripted_episodes
-from tests.support.scripted_episodes import P, episodes, model, play, script, task
+from tests.support.scripted_episodes import TICKS as PERIODS
+from tests.support.scripted_episodes import P, episodes, model, mujoco_path, play, script, task
 
 T, SUBSTEPS = 1 / 75, 4
 H = T / SUBSTEPS
@@ -43,9 +41,7 @@ def test_observation_is_the_interpolated_past(x64):
 
         def period(ring, n):
             read = latency.read_ring(ring, n - delay.periods)[0]
-            captured = sum(
-                latency.weigh_capture(delay, s, SUBSTEPS, H) * path[n * SUBSTEPS + s] for s in range(SUBSTEPS + 1)
-            )
+            captured = sum(latency.weigh_capture(delay, s, H) * path[n * SUBSTEPS + s] for s in range(SUBSTEPS + 1))
             return latency.write_ring(ring, n, captured[None]), read
 
         start = jnp.full((depth, 1, delays.shape[0]), path[0])
@@ -102,31 +98,25 @@ def test_the_task_delays_every_device_by_its_own_time():
     flies straight, without gravity, so that its path under drag has a closed form."""
     rng = np.random.default_rng(3)
     delays = {name: rng.uniform(0.0, 0.1, P) for name in LATENCIES}
-    actions = np.repeat(rng.uniform(-0.3, 0.3, (scripted_episodes.TICKS // 10, N_JOINTS, 1)), 10, axis=0)
+    actions = np.repeat(rng.uniform(-0.3, 0.3, (PERIODS // 10, N_JOINTS, 1)), 10, axis=0)
     start, velocity = np.array([0.2, 1.0, 0.4]), np.array([0.1, -1.5, 0.05])
     with jax.enable_x64(True):
         record = play(task(), episodes(start, velocity, delays, model(gravity=0.0)), script(actions))
     assert record.live.all()
-    ticked, times = np.arange(scripted_episodes.TICKS) * T, np.arange(scripted_episodes.TICKS * SUBSTEPS + 1) * H
-    mj, speed = mjcf.load_model(), np.linalg.norm(velocity)
+    ticked, times = np.arange(PERIODS) * T, np.arange(PERIODS * SUBSTEPS + 1) * H
+    speed = np.linalg.norm(velocity)
     for i in range(P):
         moments = np.maximum(ticked - delays["ball_observation"][i], 0.0)
         way = np.log1p(DRAG * speed * moments) / DRAG
         np.testing.assert_allclose(
             record.controller[:, :3, i], start + way[:, None] * velocity / speed, atol=1e-6, err_msg="ball"
         )
-        data, path = mujoco.MjData(mj), [mjcf.home_qpos(mj)]
-        data.qpos[:] = path[0]
         device = ["festo" if joint in FESTO_JOINTS else "abb" for joint in range(N_JOINTS)]
         ctrl = [
             delayed_mean(record.command[:, joint, i], delays[f"{device[joint]}_action"][i], times)
             for joint in range(N_JOINTS)
         ]
-        for command in np.transpose(ctrl):
-            data.ctrl[:] = command
-            mujoco.mj_step(mj, data)
-            path.append(data.qpos.copy())
-        path = np.array(path)
+        path = mujoco_path(np.transpose(ctrl))
         np.testing.assert_allclose(record.qpos[..., i], path[SUBSTEPS::SUBSTEPS], atol=1e-8)
         assert np.ptp(path, axis=0).min() > 0.01
         for joint in range(N_JOINTS):

@@ -8,8 +8,8 @@ import pytest
 import yaml
 from scipy import stats
 
-from mjx_tt.sim import model, randomisation
-from mjx_tt.sim.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, SimModel
+from mjx_tt.sim import arguments, model, randomisation
+from mjx_tt.sim.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, Samples, SimModel
 
 
 def test_yaml_keeps_every_parameter(tmp_path):
@@ -121,6 +121,17 @@ def test_samples_are_drawn_row_by_row_and_by_weight(tmp_path):
         "drives.joint_2.lag": [pytest.approx(0.01), pytest.approx(0.03)],
         "ball.table.height": [0.0, 0.01],
     }
+
+
+def test_a_program_s_arguments_are_the_numbers_that_differ_and_are_not_drawn():
+    height, friction = "ball.table.height", "ball.table.friction"
+    world = model.with_values(SimModel(), {"ball.table.restitution": 0.9, height: 0.01, friction: 0.2})
+    rows = Samples((friction,), np.array([[0.2], [0.3]]), np.array([1.0, 3.0]))
+    found = arguments.arguments(world, (Range(height, 0.0, 0.02), rows))
+    assert found.numbers == {"ball.table.restitution": np.float32(0.9)}
+    np.testing.assert_allclose(found.drawing[1].share, [0.25, 1.0])
+    plain = arguments.structure(world, (Range(height, 0.0, 0.02), rows))
+    assert plain["changed"] == ["ball.table.restitution"] and plain["drawn"] == [{height: [0.0, 0.02]}, {friction: 2}]
 
 
 def test_latencies_are_gaussian_in_seconds_and_cut():

@@ -70,16 +70,12 @@ def through_camera(p):
 def filtered(tau, delay):
     """By an adaptive solver of df/dt = (p - f) / tau."""
     times = np.maximum(np.arange(TICKS) * T - delay, 0.0)
-    solution = solve_ivp(
-        lambda t, f: (START + VELOCITY * t - f) / tau,
-        (0, TICKS * T),
-        START,
-        "Radau",
-        dense_output=True,
-        rtol=1e-10,
-        atol=1e-12,
-    )
-    return solution.sol(times).T
+
+    def slope(t, f):
+        return (START + VELOCITY * t - f) / tau
+
+    end, exact = (0, TICKS * T), {"rtol": 1e-10, "atol": 1e-12}
+    return solve_ivp(slope, end, START, "Radau", dense_output=True, **exact).sol(times).T
 
 
 def test_a_nominal_tracker_shows_the_truth(seen):
@@ -143,15 +139,20 @@ def test_a_filter_of_constant_acceleration_fades_behind_a_jump_of_the_velocity()
     np.testing.assert_allclose(error, wanted, atol=5e-3 * np.abs(wanted).max())
 
 
+def white_jerk(dt):
+    """Matrices (3, 3) of position, velocity and acceleration after ``dt`` [s], and of what unit density adds."""
+    move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    grown = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
+    return move, dt * np.array(grown)
+
+
 @pytest.mark.parametrize("memory", [0.004, 0.012, 0.05])
 def test_a_settled_filters_covariance_solves_riccatis_equation(memory):
     """By SciPy's solver, in seconds and metres, at 125 Hz and 3 mm of noise."""
     dt, variance = 0.008, 0.003**2
     q = variance * dt / memory**6
-    move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    shape = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
-    seen = np.array([[1.0], [0.0], [0.0]])
-    before = solve_discrete_are(move.T, seen, q * dt * np.array(shape), np.array([[variance]]))
+    move, grown = white_jerk(dt)
+    before = solve_discrete_are(move.T, np.eye(3, 1), q * grown, np.array([[variance]]))
     gain = before[:, :1] / (before[0, 0] + variance)
     after = (before - gain @ before[:1]) / variance * np.outer(*2 * [memory ** np.arange(3)])
     with jax.enable_x64(True):
@@ -176,10 +177,9 @@ def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
         for i, (dt, gate) in enumerate(zip(times, gates, strict=True)):
             hit = kick if i == 0 else 0.0
             lag = lag.predict(dt, jnp.array([0.0, 0.0, hit]), dt).correct(dt, 0.008, memory, gate)
-            move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-            shape = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
+            move, grown = white_jerk(dt)
             state = move @ state - np.array([dt * hit, hit, 0.0])
-            covariance = move @ covariance @ move.T + q * dt * np.array(shape)
+            covariance = move @ covariance @ move.T + q * grown
             if i == 0:
                 covariance = covariance + FRESH * np.diag([1.0, 0.008**-2, 0.008**-4])
             gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
