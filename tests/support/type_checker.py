@@ -11,5 +11,5 @@ F = TypeVar("F", bound=Callable)
 
 
 def checked(function: F) -> F:
-    """beartype for all but constructors of dataclasses: JAX fills pytrees with specs, shapes and sentinels."""
-    return function if function.__code__.co_filename == "<string>" else beartype(function)
+    """beartype for all but constructors: JAX fills pytrees with specs, shapes and sentinels."""
+    return function if function.__name__ == "__init__" else beartype(function)
