@@ -89,7 +89,7 @@ def train(
         with interruptible(), together.failing_fast():
             sweep.run_job(planned[0], screen, together)
         return 0
-    side_by_side = 1 if elsewhere else sweep.choose(planned, ranks.processes, ranks.devices)
+    side_by_side = 1 if elsewhere else sweep.count_processes(planned, ranks.processes, ranks.devices)
     with interruptible():
         ok = sweep.run_all(planned, screen, out, Workers(side_by_side, elsewhere, str(site)))
         if select and ok:
@@ -133,7 +133,7 @@ def compare(
     from experiments.jobs.site import Workers
 
     screen = make_console()
-    workers = Workers(1 if elsewhere else comparing.choose(loaded, processes), elsewhere, str(site))
+    workers = Workers(1 if elsewhere else comparing.count_processes(loaded, processes), elsewhere, str(site))
     with interruptible():
         folder = comparing.compare(loaded, experiment, str(path), out, screen, workers)
     screen.print(f"{folder}/comparison.html, with its figures beside it", soft_wrap=True)

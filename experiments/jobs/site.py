@@ -75,6 +75,16 @@ class Workers:
 ALONE = Workers()
 
 
+def count_processes(jobs: int, asked: int | None, alone: bool) -> int:
+    """Processes of this machine for so many jobs: as many as were asked for; else one per core.
+
+    One where a job should be ``alone``, or on an accelerator. Call it when JAX is configured.
+    """
+    if asked is None:
+        asked = 1 if alone or jax.default_backend() != "cpu" else len(os.sched_getaffinity(0))
+    return min(asked, jobs)
+
+
 class PoolEngine(Engine):
     """Processes of this machine, each on its share of the cores."""
 

@@ -24,6 +24,7 @@ from experiments.jobs.site import Workers
 from tests.support import one_node_slurm
 from tests.support.paths import ROOT
 from tests.support.small_jobs import lines
+from tests.support.tiny_experiment import wait_for
 
 HERE = {"provider": {"kind": "local"}, "workers_per_node": 2, "memory_per_worker": 0.5, "pin": True}
 needs_two = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two workers need a core each: one is here")
@@ -79,13 +80,6 @@ def do(kind: str, folder: Path, jobs: list[Job], failed: Callable | None = None,
 
 def job(name: str, deed: str = "", **rest) -> Job:
     return Job(name, (name, deed), **rest)
-
-
-def wait_for(condition: Callable[[], object], seconds: float = 120.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.05)
 
 
 # -- the order of jobs ------------------------------------------------------------------------------------------------
@@ -269,9 +263,9 @@ def test_a_batch_killed_and_resumed_by_parsl_has_the_pools_bits(by_the_pool, tmp
 
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        wait_for(lambda: begun(0), 300.0)
+        wait_for(lambda: begun(0), process)
         (tmp_path / "killed").write_text(str(kill_the_worker_of(runs / "seed0")))
-        wait_for(lambda: (runs / "seed1").exists(), 300.0)
+        wait_for(lambda: (runs / "seed1").exists(), process)
         time.sleep(3.0)
         assert process.poll() is None, process.communicate()[0]
     finally:

@@ -1,21 +1,13 @@
-"""The card says what was measured, with intervals worked out independently, and of which kind of evaluation it is."""
+"""The card says what was measured, with its interval, and of which kind of evaluation it is."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 
 from experiments.runs.locate import SHIPPED
 from experiments.sharing import card
+from experiments.stats import wilson
 from robot_io.policy import artefact as artefacts
-
-
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """Wilson 1927, written out."""
-    z, p = 1.959963984540054, k / n
-    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from experiments.runs import checkpoint
@@ -17,27 +16,10 @@ from experiments.training import ranks
 from tests.support import one_node_slurm
 from tests.support.one_node_slurm import free_ports
 from tests.support.paths import ROOT
-from tests.support.tiny_experiment import write_tiny
+from tests.support.tiny_experiment import TRAINING, assert_same_run, wait_for, write_tiny
 
 UPDATES = 120
 PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
-# The training itself without the evaluation, pictures and export that follow it.
-DRIVER = """
-import sys
-from mjx_tt import platform
-platform.configure(int(sys.argv[3]))
-from rich.console import Console
-from experiments.config import build, experiment as config
-from experiments.runs.run_dir import Run
-from experiments.training import loop, ranks
-numbers = map(int, sys.argv[5:]) if sys.argv[5:] else (None, None)
-together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.SINGLE
-with together.failing_fast():
-    experiment = build.experiment(config.load(sys.argv[1]), sys.argv[1])
-    loop.train(experiment, Run(sys.argv[2]), Console(), together)
-    together.disconnect()
-"""
-TRAINING = [sys.executable, "-c", DRIVER]
 
 
 @pytest.fixture(scope="module")
@@ -57,20 +39,6 @@ def address() -> str:
     return f"127.0.0.1:{free_ports(1)[0]}"
 
 
-def state(run: Path) -> dict[str, np.ndarray]:
-    found = checkpoint.read_latest(run / "checkpoints")
-    assert found is not None and found[1]["update"] == UPDATES
-    return found[0]
-
-
-def assert_equal(run: Path, reference: Path) -> None:
-    ours, theirs = state(run), state(reference)
-    assert ours.keys() == theirs.keys()
-    assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
-    rows, expected = ([row | {"seconds": 0} for row in read(f / "metrics.jsonl")] for f in (run, reference))
-    assert len(rows) == UPDATES and rows == expected, "evaluations on the way are in them"
-
-
 @pytest.fixture(scope="module")
 def alone(yaml, tmp_path_factory) -> Path:
     """One process with two devices."""
@@ -87,7 +55,7 @@ def test_two_processes_are_one_with_two_devices(yaml, alone, tmp_path):
     (said, errors), (silent, _) = first.communicate(timeout=300), second.communicate(timeout=300)
     assert (first.returncode, second.returncode) == (0, 0), errors
     assert "trained by 2 processes, ended by updates" in said and silent == ""
-    assert_equal(tmp_path / "tiny", alone)
+    assert_same_run(tmp_path / "tiny", alone, UPDATES)
     assert (tmp_path / "tiny" / "artefact" / "manifest.json").exists()
 
 
@@ -97,10 +65,7 @@ def test_a_lost_process_ends_the_other_with_a_checkpoint(victim, number, yaml, a
     run = tmp_path / "tiny"
     processes = pair(*TRAINING, str(yaml), str(run), "1", address(), "2")
     try:
-        until = time.monotonic() + 240.0
-        while not read(run / "metrics.jsonl"):
-            assert time.monotonic() < until and processes[0].poll() is None
-            time.sleep(0.01)
+        wait_for(lambda: read(run / "metrics.jsonl"), processes[0])
         processes[victim].send_signal(number)
         lost = time.monotonic()
         _, errors = processes[1 - victim].communicate(timeout=60)
@@ -115,7 +80,7 @@ def test_a_lost_process_ends_the_other_with_a_checkpoint(victim, number, yaml, a
     assert 0 < kept < UPDATES and f"checkpoint after update {kept} is kept" in errors
     resumed = subprocess.run([*TRAINING, str(yaml), str(run), "2"], cwd=ROOT, capture_output=True, text=True)
     assert resumed.returncode == 0 and f"continues after update {kept}" in resumed.stdout, resumed.stderr
-    assert_equal(run, alone)
+    assert_same_run(run, alone, UPDATES)
 
 
 @pytest.mark.slow
@@ -125,7 +90,7 @@ def test_slurm_starts_the_processes(yaml, alone, tmp_path):
         command = ["srun", "-n", "2", *TRAINING, str(yaml), str(tmp_path / "tiny"), "1", "auto"]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert_equal(tmp_path / "tiny", alone)
+    assert_same_run(tmp_path / "tiny", alone, UPDATES)
 
 
 def test_the_watch_calls_once_signs_stop(monkeypatch):
