@@ -43,6 +43,8 @@ except Exception as error:
     sys.exit(f"explained: {error}")
 """
 TRAINING = [sys.executable, "-c", DRIVER]
+# ``mjx-tt train`` as a whole.
+PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
 
 
 def write_tiny(folder: Path, evaluation: dict[str, Any] | None = None, **training: Any) -> Path:

@@ -1,8 +1,9 @@
-"""Experiment YAMLs: what is shipped loads, and a mistake is named with its place and the way out."""
+"""YAMLs of experiments, sites and fine-tunings: a mistake is named with its place and the way out."""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 
 import jsonschema
@@ -10,10 +11,11 @@ import pytest
 import yaml
 
 from ballmodel import registry
-from experiments.config import build, files
+from experiments.config import build, experiment, files, finetuning, site
 from experiments.config import experiment as config
 from experiments.config.prior import PRIOR
 from experiments.errors import ConfigError
+from experiments.jobs.site import accelerators
 
 SMALLEST = {"name": "a", "balls": "narrow"}
 
@@ -158,3 +160,63 @@ def test_the_prior_is_drawn_where_a_model_names_it(tmp_path):
         build.experiment(other, str(file))
     file.write_text("name: a\nballs: narrow\nrobot: ur10e_rail\n")
     assert build.unknown_worlds(build.experiment(config.load(file), str(file))) is None
+
+
+CORES = len(os.sched_getaffinity(0))
+SLURM = {"provider": {"kind": "slurm", "walltime": "01:30:00"}, "workers_per_node": 16}
+LOCAL = {"provider": {"kind": "local"}, "workers_per_node": 1}
+
+
+def write(folder, data):
+    path = folder / "cluster.yaml"
+    path.write_text(data if isinstance(data, str) else yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (SLURM | {"worker_per_node": 2}, r"worker_per_node: expected .*; did you mean 'workers_per_node'\?"),
+        (SLURM | {"provider": {"kind": "slurn"}}, r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'"),
+        (
+            SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
+            r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got '90'",
+        ),
+        (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
+        (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
+        ("- slurm", r"cluster.yaml: expected a mapping, got \['slurm'\]"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path, data, message):
+    path = write(tmp_path, data)
+    with pytest.raises(ConfigError, match=message) as error:
+        site.load(path)
+    assert all("cluster.yaml" in line for line in str(error.value).splitlines())
+
+
+def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
+    two = site.load(write(tmp_path, SLURM | {"workers_per_node": 2, "accelerators_per_worker": 2}))
+    assert accelerators(two) == ["0,1", "2,3"]
+    assert accelerators(site.load(write(tmp_path, SLURM))) == []
+
+
+def shipped(name: str) -> experiment.Config:
+    return experiment.load(experiment.shipped()[name])
+
+
+def test_defaults_are_the_papers_but_for_policies_by_first_order_gradients():
+    for trained in (None, shipped("quickstart")):
+        settings = finetuning.load(trained=trained)
+        assert (settings.sigma, settings.step.learning_rate) == (0.025, 0.00375)
+    settings = finetuning.load(trained=shipped("robust"))
+    assert (settings.sigma, settings.step.learning_rate) == (0.01, 0.0015)
+    # The step of both is the same share of the perturbation, and all else is alike.
+    assert settings.sigma / settings.step.learning_rate == pytest.approx(0.025 / 0.00375)
+    assert settings.model_copy(update={"sigma": 0.025, "step": finetuning.FineTuning().step}) == finetuning.FineTuning()
+
+
+def test_own_settings_come_before_both(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text("sigma: 0.02\n")
+    settings = finetuning.load(path, ("step.learning_rate=0.001",), shipped("robust"))
+    assert (settings.sigma, settings.step.learning_rate) == (0.02, 0.001)

@@ -24,7 +24,7 @@ from experiments.jobs.site import Workers
 from tests.support import one_node_slurm
 from tests.support.paths import ROOT
 from tests.support.small_jobs import lines
-from tests.support.tiny_experiment import wait_for
+from tests.support.tiny_experiment import PROGRAM, wait_for
 
 HERE = {"provider": {"kind": "local"}, "workers_per_node": 2, "memory_per_worker": 0.5, "pin": True}
 needs_two = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two workers need a core each: one is here")
@@ -37,7 +37,6 @@ training: {updates: UPDATES, pool: 64, evaluate_every: null, checkpoint_seconds:
 evaluation: {episodes: 16, sim_rate: 75.0, reachable_balls: null}
 """
 SEEDS = "0,1,2"
-PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
 # Jobs of tests by a process of its own: it gets signals.
 DRIVER = """
 import json, sys
