@@ -55,7 +55,7 @@ class Keys:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("own", [None, "fr3_pedestal", "ur10e_rail"])
+@pytest.mark.parametrize("own", [None, "fr3_pedestal"])
 def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, monkeypatch, own):
     contract = PAPER if own is None else simulated.load_shipped(own).contract
     ports, got, finish = free_ports(len(contract.carrying)), [], threading.Event()

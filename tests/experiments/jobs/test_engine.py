@@ -176,7 +176,7 @@ def test_an_error_stops_all_or_costs_its_own_job_alone(kind, tmp_path):
 
 @pytest.mark.slow
 @needs_two
-@pytest.mark.parametrize("kind, how", [("pool", "SIGINT"), ("pool", "SIGTERM"), ("parsl", "SIGINT"), ("parsl", STOP)])
+@pytest.mark.parametrize("kind, how", [("pool", "SIGINT"), ("pool", STOP), ("parsl", "SIGINT")])
 def test_a_stop_lets_the_jobs_save(kind, how, tmp_path):
     given = str(site_file(tmp_path)) if kind == "parsl" else None
     deeds = {"a": "long", "b": "long", "c": ""}

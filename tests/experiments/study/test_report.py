@@ -263,9 +263,13 @@ def whole(tmp_path_factory):
     return folder
 
 
-def test_measured_means_are_the_known_ones(whole):
-    study = study_data.load(whole)
-    m, counted = Measurements(study), Bootstrap(study.pick(own=None, selected=False))
+@pytest.fixture(scope="module")
+def measurements(whole):
+    return Measurements(study_data.load(whole))
+
+
+def test_measured_means_are_the_known_ones(measurements):
+    m, counted = measurements, Bootstrap(measurements.study.pick(own=None, selected=False))
     for model in study_paper.TEN:
         for player in ("player3", "player1"):
             known, found = made_up_study.mean_length(player, model), counted.mean(model, [player])
@@ -277,8 +281,8 @@ def test_measured_means_are_the_known_ones(whole):
     assert m.robot_ended_share().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
 
 
-def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
-    found = Measurements(study_data.load(whole)).findings
+def test_claims_are_judged_as_the_made_up_numbers_demand(measurements):
+    found = measurements.findings
     assert set(found) == {claim.key for claim in study_paper.CLAIMS}
     for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
         assert found[key].verdict.startswith("agrees"), (key, found[key])
@@ -309,7 +313,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
     assert paper[0] == ["player3 (beginner)", "paper", "2", "3", "7", "5.9", "9", "52", "500"]
 
 
-def test_identified_worlds_stand_beside_the_opened_reality(whole):
+def test_identified_worlds_stand_beside_the_opened_reality(whole, measurements):
     with open(whole / "report" / "identified.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     held = {(row["parameter"], row["truth"], row["holds it"]) for row in rows}
@@ -319,8 +323,7 @@ def test_identified_worlds_stand_beside_the_opened_reality(whole):
     assert counted["different intervals of 90 % that hold the truth"] == "2 of 4"  # of two seeds, both players alike
     assert counted["decided by"] == "prior"
     assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
-    m = Measurements(study_data.load(whole))
-    ratio, known = m.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
+    ratio, known = measurements.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
     assert ratio.low < known < ratio.high
 
 
