@@ -102,15 +102,8 @@ class Run:
 
     def _untouched(self) -> bool:
         """True where the folder holds no more than the records of a start: no checkpoint, no measurement."""
-        kept = {
-            CONFIG,
-            SESSIONS,
-            LOCK,
-            self.output.name,
-            self.checkpoints.name,
-            self.metrics.name,
-            self.tensorboard.name,
-        }
+        made = (self.output, self.checkpoints, self.metrics, self.tensorboard)
+        kept = {CONFIG, SESSIONS, LOCK, *(path.name for path in made)}
         if any(path.name not in kept for path in self.folder.iterdir()):
             return False
         measured = self.metrics.exists() and self.metrics.stat().st_size > 0

@@ -15,7 +15,7 @@ from rich.console import Console
 from ballmodel import registry
 from experiments.baselines import compare
 from experiments.baselines.learners import BudgetSpent, PpoLearner, SacLearner
-from experiments.config import baselines
+from experiments.config import baselines, files
 from experiments.config import experiment as config
 from experiments.config.baselines import Ppo, Sac
 from experiments.config.site import Site
@@ -223,15 +223,15 @@ def test_an_algorithm_trains_in_a_world_of_its_own_and_is_judged_in_that_of_all(
             compare.prepare(*baselines.load(path, (f"algorithms.own.{override}",)), str(path), tmp_path, Console())
 
 
-@pytest.mark.parametrize("name", baselines.shipped())
+@pytest.mark.parametrize("name", files.shipped("compare"))
 def test_a_shipped_comparison_is_valid(name):
-    comparison, experiment = baselines.load(baselines.shipped()[name])
+    comparison, experiment = baselines.load(files.find_shipped(name, "compare"))
     assert comparison.name == name
 
 
 def test_the_pillars_change_elites_and_orthogonality_of_the_papers_settings_alone():
-    comparison, experiment = baselines.load(baselines.shipped()["compare_pillars"])
-    paper = config.load(config.shipped()["paper"])
+    comparison, experiment = baselines.load(files.find_shipped("compare_pillars", "compare"))
+    paper = config.load(files.find_shipped("paper", "train"))
     assert (experiment.task, experiment.model) == (paper.task, paper.model)
     rows = {name: learning.optimiser for name, learning in comparison.algorithms.items()}
     assert rows["difference-orthogonal"] == paper.optimiser

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from ballmodel import registry
+from ballmodel.io import validation
 from experiments.config import build, experiment, files, finetuning, site
 from experiments.config import experiment as config
 from experiments.config.prior import PRIOR
@@ -37,9 +38,9 @@ def complaint(data: dict) -> str:
     return str(raised.value)
 
 
-@pytest.mark.parametrize("path", config.shipped().values(), ids=config.shipped().keys())
+@pytest.mark.parametrize("path", files.shipped("train").values(), ids=files.shipped("train"))
 def test_shipped_experiments_load_and_fit_the_schema(path):
-    jsonschema.validate(files.read_yaml(path.read_text(), str(path)), config.json_schema())
+    jsonschema.validate(files.read_yaml(path.read_text(), str(path)), validation.json_schema(config.Config))
     loaded = config.load(path)
     assert loaded.name == path.stem
     build.experiment(loaded, str(path))
@@ -119,7 +120,7 @@ def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_curr
 
 def test_paper_settings_are_the_papers():
     """The table of hyper-parameters in the paper's appendix."""
-    built = build.experiment(config.load(config.shipped()["paper"]), "paper")
+    built = build.experiment(config.load(files.find_shipped("paper", "train")), "paper")
     bgs = built.bgs
     assert (bgs.num_directions, bgs.sigma, bgs.elite_fraction, bgs.orthogonal, bgs.ema_decay) == (
         200,
@@ -128,16 +129,16 @@ def test_paper_settings_are_the_papers():
         True,
         0.0,
     )
-    paper = config.load(config.shipped()["paper"])
+    paper = config.load(files.find_shipped("paper", "train"))
     assert paper.optimiser.repeats == 15
     assert built.task.sim_rate == 300 and built.task.contact_ends_episode
     assert built.model.model.ball.flight.integrator == "paper"
     drawn = {one.path: [one.low, one.high] for one in built.model.randomise}  # dynamics; latencies and noise as printed
     assert drawn["ball.table.restitution"] == [0.88, 0.98] and drawn["drives.joint_2.lag"] == [0.0, 0.025]
     assert len(drawn) == 4 + 2 * 8 and drawn.items() <= PRIOR.items()
-    assert config.load(config.shipped()["paper_mjx"], ("task.engine=fused", "name=paper")) == paper
-    assert config.load(config.shipped()["paper_mjx"]).task.engine == "mjx"
-    falling = config.load(config.shipped()["quickstart"], ("optimiser.sigma_fall={final: 0.01}",))
+    assert config.load(files.find_shipped("paper_mjx", "train"), ("task.engine=fused", "name=paper")) == paper
+    assert config.load(files.find_shipped("paper_mjx", "train")).task.engine == "mjx"
+    falling = config.load(files.find_shipped("quickstart", "train"), ("optimiser.sigma_fall={final: 0.01}",))
     sigma = build.experiment(falling, "quickstart").bgs.sigma
     assert (sigma(0), sigma(falling.training.updates)) == (0.025, pytest.approx(0.01))
     change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
@@ -201,7 +202,7 @@ def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
 
 
 def shipped(name: str) -> experiment.Config:
-    return experiment.load(experiment.shipped()[name])
+    return experiment.load(files.find_shipped(name, "train"))
 
 
 def test_defaults_are_the_papers_but_for_policies_by_first_order_gradients():

@@ -89,7 +89,7 @@ def test_a_program_compiled_for_some_samples_serves_others(pool):
 
 def test_samples_of_the_same_parameters_have_one_program_others_another():
     def program(model: dict) -> str:
-        config = experiment.load(experiment.shipped()["quickstart"]).model_copy(update={"model": model})
+        config = experiment.load(files.find_shipped("quickstart", "train")).model_copy(update={"model": model})
         return loop.program(config, 1)
 
     def world(restitution: float, height: float, **samples: list) -> dict:
