@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,13 +240,7 @@ def until(session, condition):
 def on_the_simulated_clock(policy, monkeypatch):
     """A simulated control process, and its session."""
     simulated = Simulated(policy, monkeypatch)
-
-    def control():
-        with simulated.control:
-            simulated.control.run()
-
-    thread = threading.Thread(target=control, daemon=True)
-    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
+    thread = simulated.thread(monkeypatch)
     monkeypatch.setattr(sessions, "SETTLE", 0.0)
     thread.start()
     with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -157,18 +158,30 @@ def test_slurm_starts_the_processes(shared, alone, tmp_path):
 
 
 def test_the_watch_calls_once_signs_stop(monkeypatch):
-    monkeypatch.setattr(ranks, "SILENCE", 0.6)
+    """On a clock of its own."""
     called: list[float] = []
-    with ranks.Ranks(2, 0).watch(called.append) as watchdog:  # type: ignore[arg-type] - it returns here
-        time.sleep(1.2)
-        assert not called, "before the first sign, which waits for compilations"
-        for _ in range(8):
-            watchdog.beat()
-            time.sleep(0.2)
-        assert not called
-        watchdog.pause()
-        time.sleep(1.2)
-        assert not called, "nor in a pause"
-        watchdog.beat()
-        time.sleep(1.6)
-        assert called and called[0] > 0.6
+    now = [0.0]
+    monkeypatch.setattr(ranks, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    watchdog = ranks.Watchdog(called.append)  # type: ignore[arg-type] - it returns here
+
+    def watch(seconds: float, beats: bool = False) -> None:
+        until = now[0] + seconds
+
+        def wait(step: float) -> bool:
+            now[0] += step
+            if beats:
+                watchdog.beat()
+            return now[0] > until
+
+        watchdog._over = SimpleNamespace(wait=wait)
+        watchdog.run()
+
+    watch(100.0)
+    assert not called, "before the first sign, which waits for compilations"
+    watch(100.0, beats=True)
+    watchdog.pause()
+    watch(100.0)
+    assert not called, "nor while signs come, nor in a pause"
+    watchdog.beat()
+    watch(ranks.SILENCE + 1.0)
+    assert called and called[0] > ranks.SILENCE
