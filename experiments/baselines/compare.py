@@ -79,8 +79,8 @@ def count_processes(comparison: Comparison, asked: int | None) -> int:
 
     Call it when JAX is configured.
     """
-    trainings = len(comparison.algorithms) * len(comparison.seeds)
-    return site.count_processes(trainings, asked, alone=comparison.budget.minutes is not None)
+    jobs = len(comparison.algorithms) * len(comparison.seeds)
+    return site.count_processes(jobs, asked, alone=comparison.budget.minutes is not None)
 
 
 def compare(
