@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -43,8 +44,9 @@ except Exception as error:
     sys.exit(f"explained: {error}")
 """
 TRAINING = [sys.executable, "-c", DRIVER]
-# ``mjx-tt train`` as a whole.
+# ``mjx-tt train`` as a whole; with this environment it draws no films, which take longest without a graphics card.
 PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
+NO_FILMS = os.environ | {"MUJOCO_GL": "disable"}
 
 
 def write_tiny(folder: Path, evaluation: dict[str, Any] | None = None, **training: Any) -> Path:

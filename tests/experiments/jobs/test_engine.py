@@ -24,7 +24,7 @@ from experiments.jobs.site import Workers
 from tests.support import one_node_slurm
 from tests.support.paths import ROOT
 from tests.support.small_jobs import lines
-from tests.support.tiny_experiment import PROGRAM, wait_for, write_tiny
+from tests.support.tiny_experiment import NO_FILMS, PROGRAM, wait_for, write_tiny
 
 HERE = {"provider": {"kind": "local"}, "workers_per_node": 2, "memory_per_worker": 0.5, "pin": True}
 needs_two = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two workers need a core each: one is here")
@@ -219,7 +219,9 @@ def training(folder: Path, *more: str) -> list[str]:
 def by_the_pool(tmp_path_factory) -> Path:
     """Folder of runs."""
     folder = tmp_path_factory.mktemp("pool")
-    done = subprocess.run(training(folder, "--processes", "2"), cwd=ROOT, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        training(folder, "--processes", "2"), cwd=ROOT, env=NO_FILMS, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "3 runs, 2 processes at a time" in done.stdout
     return folder / "tiny"
@@ -251,7 +253,9 @@ def test_a_batch_killed_and_resumed_by_parsl_has_the_pools_bits(by_the_pool, tmp
         path = runs / f"seed{seed}" / "metrics.jsonl"
         return path.exists() and path.stat().st_size > 0
 
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=NO_FILMS, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     try:
         wait_for(lambda: begun(0), process)
         (tmp_path / "killed").write_text(str(kill_the_worker_of(runs / "seed0")))
@@ -262,7 +266,7 @@ def test_a_batch_killed_and_resumed_by_parsl_has_the_pools_bits(by_the_pool, tmp
         process.kill()
         process.stdout.close()
         process.wait()
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
+    done = subprocess.run(command, cwd=ROOT, env=NO_FILMS, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert_equal(runs, by_the_pool)
     assert not list((tmp_path / ".jobs").iterdir()), "neither the killed session's heartbeat nor this one's is left"
@@ -284,6 +288,7 @@ def test_a_batch_on_slurm_has_the_pools_bits(by_the_pool, tmp_path):
     slurm = site_file(tmp_path, provider=provider, memory_per_worker=1.0, workers_per_node=1)
     with one_node_slurm.slurm(tmp_path / "slurm") as environment:
         command = training(tmp_path, "--site", str(slurm))
+        environment |= {"MUJOCO_GL": "disable"}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
         left = subprocess.run(["squeue", "-h"], env=environment, capture_output=True, text=True).stdout
     assert done.returncode == 0, done.stdout + done.stderr

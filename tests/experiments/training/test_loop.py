@@ -20,7 +20,7 @@ from experiments.training import ranks
 from tests.support import one_node_slurm
 from tests.support.one_node_slurm import free_ports
 from tests.support.paths import ROOT
-from tests.support.tiny_experiment import PROGRAM, TRAINING, assert_same_run, wait_for, write_tiny
+from tests.support.tiny_experiment import NO_FILMS, PROGRAM, TRAINING, assert_same_run, wait_for, write_tiny
 
 UPDATES, FEW = 600, 120
 
@@ -95,7 +95,7 @@ def shared(tmp_path_factory) -> Path:
 
 def pair(*command: str) -> list[subprocess.Popen]:
     """Two processes, whose numbers end the command."""
-    to_pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    to_pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": NO_FILMS}
     return [subprocess.Popen([*command, str(i)], cwd=ROOT, **to_pipes) for i in range(2)]
 
 
