@@ -25,7 +25,7 @@ from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
 from benchmarks.harness import each_missing, read_all, run
 from experiments import measurements
-from experiments.config import build, experiment
+from experiments.config import build, experiment, files
 from experiments.config import study as studies
 from experiments.runs import load_policy, run_dir
 from experiments.runs.run_dir import Run
@@ -180,7 +180,7 @@ def trained(folder: Path, world: ModelFile, updates: int, human: Path) -> Policy
         "training.evaluate_every=null",
         "training.devices=1",
     )
-    config = experiment.load(experiment.shipped()["robust"], overrides)
+    config = experiment.load(files.find_shipped("robust", "train"), overrides)
     made, run = build.experiment(config, folder.name), Run(folder)
     if not run.trained(made.config):
         train(made, run, Console(quiet=True))

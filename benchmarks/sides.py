@@ -181,11 +181,11 @@ def _rollout(changes: list[str], devices: int | None) -> tuple[Callable, tuple, 
 def _trainer(changes: list[str], name: str = "paper") -> tuple[Trainer, TrainState]:
     import jax
 
-    from experiments.config import build, experiment
-    from experiments.training import trainers
+    from experiments.config import build, experiment, files
+    from experiments.training.loop import make_trainer
 
-    config = experiment.load(experiment.shipped()[name], tuple(changes))
-    trainer = trainers.trainer(build.experiment(config, name))
+    config = experiment.load(files.find_shipped(name, "train"), tuple(changes))
+    trainer = make_trainer(build.experiment(config, name))
     return trainer, trainer.init(jax.random.key(0))
 
 

@@ -286,9 +286,3 @@ def load_model(path: str | Path | None) -> SimModel:
 
     with error_context("--model"):
         return SimModel() if path is None else ModelFile.load(path).model
-
-
-def find_shipped(name: str, shipped: dict[str, Path]) -> Path:
-    """The file of that name, or the one of that name that comes with the program."""
-    path = Path(name)
-    return path if path.exists() or path.parent != Path() else shipped.get(path.stem, path)

@@ -81,6 +81,7 @@ def field_notes(kind: type) -> tuple[str, dict[str, str]]:
 
 def write_all() -> None:
     """Write every generated page."""
+    from ballmodel.io import validation
     from experiments.config import baselines, experiment, site, study
     from experiments.config.finetuning import FineTuning
     from experiments.config.robot import COMMISSIONING
@@ -89,7 +90,7 @@ def write_all() -> None:
 
     GENERATED.mkdir(parents=True, exist_ok=True)
     known: dict[str, Section] = {}  # sections that several files share are described once
-    _write("experiment", schema_page("Experiment", "mjx-tt train", experiment.json_schema(), known))
+    _write("experiment", schema_page("Experiment", "mjx-tt train", validation.json_schema(experiment.Config), known))
     _write("fine-tuning", schema_page("Fine-tuning", "mjx-tt finetune", FineTuning.model_json_schema(), known))
     _write("study", schema_page("Study", "mjx-tt is2r", study.Study.model_json_schema(), known))
     _write("comparison", schema_page("Comparison", "mjx-tt compare", baselines.Comparison.model_json_schema(), known))

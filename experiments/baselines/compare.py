@@ -14,14 +14,12 @@ An algorithm with a seed is trained in one go: interrupted, that one begins agai
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 
 from experiments.baselines import report
@@ -39,11 +37,11 @@ from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, error_context
-from experiments.jobs import engine
+from experiments.jobs import engine, site
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import checkpoint, run_dir
-from experiments.training.trainers import trainer
+from experiments.training.loop import make_trainer
 from mjx_tt.env.brax import TableTennis
 from mjx_tt.env.episode import Controller
 from mjx_tt.env.rollout import Simulator
@@ -76,18 +74,13 @@ class Common:
         return shared | judged | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
 
-def choose(comparison: Comparison, processes: int | None) -> int:
-    """Number of processes: ``processes`` where it is given, else one per core, and no more than trainings.
+def count_processes(comparison: Comparison, asked: int | None) -> int:
+    """Number of processes; one where minutes are the budget, as what a training does in them depends on neighbours.
 
-    One where minutes are the budget: what a training does in them would depend on its neighbours. Call it when JAX is
-    configured.
+    Call it when JAX is configured.
     """
-    most = len(comparison.algorithms) * len(comparison.seeds)
-    if processes is not None:
-        return min(processes, most)
-    if comparison.budget.minutes is not None or jax.default_backend() != "cpu":
-        return 1
-    return min(len(os.sched_getaffinity(0)), most)
+    jobs = len(comparison.algorithms) * len(comparison.seeds)
+    return site.count_processes(jobs, asked, alone=comparison.budget.minutes is not None)
 
 
 def compare(
@@ -163,7 +156,7 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner:
             bgs = build.bgs_config(settings.optimiser, settings.schedule_updates)
         training = config.training.model_copy(update={"devices": 1})
         config = config.model_copy(update={"optimiser": settings.optimiser, "training": training})
-        return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))
+        return EvolutionLearner(make_trainer(replace(experiment, config=config, bgs=bgs)))
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
     simulator = Simulator(experiment.task, 1)
     env = TableTennis(simulator, pool, model.model, model.randomise)

@@ -278,12 +278,13 @@ def place(
         before = robots.load(path)
     if out is None and path.is_relative_to(robots.SHIPPED):
         raise ConfigError(f"{robot}: comes with the program and is not changed; name another file with --out")
-    found = placement.search(before, build.distribution(balls, "--balls"), samples, seed)
-    if found.score <= found.before:
-        screen.print(f"{path}: no better place found (score {found.before:.3f}); nothing written")
+    now, score, old = placement.search(before, build.distribution(balls, "--balls"), samples, seed)
+    if score <= old:
+        screen.print(f"{path}: no better place found (score {old:.3f}); nothing written")
         return 1
-    placement.write(found.robot, path, out or path)
-    for line in placement.description(before, found):
+    placement.write(now, path, out or path)
+    screen.print(f"score {old:.3f} -> {score:.3f} (share of balls that can be met in time)", soft_wrap=True)
+    for line in placement.description(before, now):
         screen.print(line, soft_wrap=True)
     screen.print(f"{out or path}: written", soft_wrap=True)
     return 0

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from experiments import options
 from experiments.commands import command
+from experiments.config import files
 from experiments.config import study as study_config
 from experiments.errors import ConfigError
 from experiments.interrupts import interruptible
@@ -48,7 +49,7 @@ def is2r(
     site: options.Site = None,
 ) -> int:
     """Runs a study of the iterative loop: simulate, play, refine."""
-    loaded = study_config.load(options.find_shipped(study, study_config.shipped()), overrides)
+    loaded = study_config.load(files.find_shipped(study, "study"), overrides)
     elsewhere = options.load_site(site, processes=processes, devices=devices)
     if elsewhere is not None and loaded.robot is not None:
         raise ConfigError(f"--site {site}: with a robot the steps are done where it stands; allowed: local")

@@ -8,9 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from ballmodel.io import validation
 from experiments import options
 from experiments.commands import command
-from experiments.config import baselines
+from experiments.config import baselines, files
 from experiments.config import experiment as config
 from experiments.errors import ConfigError, error_context
 from experiments.interrupts import interruptible
@@ -69,7 +70,7 @@ def train(
         raise ConfigError(f"--robot {robot}: plays the choice among seeds; give --select")
     if robot is not None:
         options.ROBOT.check(robot)
-    paths = [options.find_shipped(name, config.shipped()) for name in experiments]
+    paths = [files.find_shipped(name, "train") for name in experiments]
     configs = [(str(path), config.load(path, overrides)) for path in paths]
     elsewhere = options.load_site(site, processes=ranks.processes, devices=ranks.devices)
     options.check_writable(out)
@@ -89,7 +90,7 @@ def train(
         with interruptible(), together.failing_fast():
             sweep.run_job(planned[0], screen, together)
         return 0
-    side_by_side = 1 if elsewhere else sweep.choose(planned, ranks.processes, ranks.devices)
+    side_by_side = 1 if elsewhere else sweep.count_processes(planned, ranks.processes, ranks.devices)
     with interruptible():
         ok = sweep.run_all(planned, screen, out, Workers(side_by_side, elsewhere, str(site)))
         if select and ok:
@@ -124,7 +125,7 @@ def compare(
     site: options.Site = None,
 ) -> None:
     """Compares learning algorithms on one task."""
-    path = options.find_shipped(comparison, baselines.shipped())
+    path = files.find_shipped(comparison, "compare")
     loaded, experiment = baselines.load(path, overrides)
     elsewhere = options.load_site(site, processes=processes)
     options.check_writable(out)
@@ -133,7 +134,7 @@ def compare(
     from experiments.jobs.site import Workers
 
     screen = make_console()
-    workers = Workers(1 if elsewhere else comparing.choose(loaded, processes), elsewhere, str(site))
+    workers = Workers(1 if elsewhere else comparing.count_processes(loaded, processes), elsewhere, str(site))
     with interruptible():
         folder = comparing.compare(loaded, experiment, str(path), out, screen, workers)
     screen.print(f"{folder}/comparison.html, with its figures beside it", soft_wrap=True)
@@ -164,4 +165,4 @@ and as the first line of a YAML:
 )
 def schema() -> None:
     """Prints the JSON schema of an experiment YAML, for your editor."""
-    print(json.dumps(config.json_schema(), indent=2))
+    print(json.dumps(validation.json_schema(config.Config), indent=2))

@@ -195,13 +195,8 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
             config.absolute_paths(settings, folder)
 
 
-def shipped() -> dict[str, Path]:
-    """The comparisons that come with the program, by name."""
-    return files.shipped("compare")
-
-
 def _experiment(given: str | dict[str, Any], where: str) -> Config:
     if isinstance(given, dict):
         return config.parse(given, f"{where}: experiment")
     path = Path(given)
-    return config.load(path if path.exists() else config.shipped().get(path.stem, path))
+    return config.load(path if path.exists() else files.shipped("train").get(path.stem, path))

@@ -239,13 +239,3 @@ def absolute_samples(model: Any, folder: Path) -> None:
 def parse(data: dict[str, Any], where: str) -> Config:
     """A Config from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
     return files.validate(Config, data, where)
-
-
-def json_schema() -> dict[str, Any]:
-    """JSON schema of an experiment YAML, for editors that complete and check while one types."""
-    return validation.json_schema(Config)
-
-
-def shipped() -> dict[str, Path]:
-    """The experiments that come with the program, by name."""
-    return files.shipped("train")

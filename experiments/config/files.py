@@ -104,6 +104,12 @@ def shipped(folder: str) -> dict[str, Path]:
     return {path.stem: path for path in sorted((SHIPPED / folder).glob("*.yaml"))}
 
 
+def find_shipped(name: str, folder: str) -> Path:
+    """The file of that name, or the one of that name in a folder of SHIPPED."""
+    path = Path(name)
+    return path if path.exists() or path.parent != Path() else shipped(folder).get(path.stem, path)
+
+
 def _find_kind(data: dict[str, Any]) -> str | None:
     """Kind of YAML that its keys point to; None where they do not tell."""
     return next((kind for kind, (_, key, _) in KINDS.items() if key in data), None)

@@ -238,8 +238,3 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
 def parse(data: dict[str, Any], where: str) -> Study:
     """A Study from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
     return files.validate(Study, data, where)
-
-
-def shipped() -> dict[str, Path]:
-    """The studies that come with the program, by name."""
-    return files.shipped("study")

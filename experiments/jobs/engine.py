@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,60 +80,24 @@ class Engine:
     replaces: bool
 
     def __init__(self, setup: Setup, folder: Path) -> None:
-        self._heartbeat, self._failed = Heartbeat(folder.absolute() / FOLDER), False
-        self._session = (setup.prepared, str(self._heartbeat.folder), str(Path.cwd()), self.replaces)
+        self.heartbeat = Heartbeat(folder.absolute() / FOLDER)
+        self._session = (setup.prepared, str(self.heartbeat.folder), str(Path.cwd()), self.replaces)
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Begins a job. Raises nothing."""
+        return self._call(worker.work, *self._session, job.name, job.arguments)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Result of the function in a worker."""
         raise NotImplementedError
 
-    def _explain(self, job: Job, error: BaseException) -> BaseException:
+    def explain(self, job: Job, error: BaseException) -> BaseException:
         """A job's error in words for the person who gave it, where it is not the job's own."""
         raise NotImplementedError
 
-    def _end(self) -> None:
+    def end(self) -> None:
         """Ends the workers."""
         raise NotImplementedError
-
-    def submit(self, job: Job) -> Future[Any]:
-        """Begins a job, whose end ``result`` takes. Raises nothing."""
-        try:
-            return self._call(worker.work, *self._session, job.name, job.arguments)
-        except RuntimeError as error:  # of a pool whose process was killed in another job
-            done: Future[Any] = Future()
-            done.set_exception(error)
-            return done
-
-    def result(self, job: Job, done: Future[Any]) -> Any:
-        """Result of a job that has ended, or ``Stopped``. Raises what the job does, or RunError."""
-        if done.cancelled():
-            return Stopped("")
-        error = done.exception()
-        if error is None:
-            return done.result()
-        self._failed = True
-        raise self._explain(job, error)
-
-    def check(self) -> None:
-        """Raises KeyboardInterrupt where the file ``stop`` asks for it."""
-        if self._heartbeat.asked_to_stop():
-            raise KeyboardInterrupt
-
-    def stop(self, running: Iterable[Future[Any]], at_once: bool) -> None:
-        """Asks the workers to save and to stop, and waits for those that have begun; ``at_once``: ends them."""
-        if at_once:
-            self._heartbeat.close(keep=True)
-            return
-        self._heartbeat.stop()
-        until = time.monotonic() + SAVING
-        while time.monotonic() < until and self._heartbeat.busy():
-            wait(running, 0.2)
-        wait(running, 1.0)  # results under way
-
-    def close(self) -> None:
-        """Ends the workers, which are idle."""
-        self._end()
-        self._heartbeat.close(keep=self._failed)
 
 
 def run(
@@ -146,11 +110,12 @@ def run(
 
     failed: told of a job's error, which then costs no other job; without it the first error stops the others, which
     save what they have, and is raised. Ctrl-C and SIGTERM stop all in the same way and raise KeyboardInterrupt with
-    what the jobs said.
+    what the jobs said; so does the file ``stop``.
     """
     waiting = list(jobs)
     running: dict[Future[Any], Job] = {}
     warm: set[str] = set()
+    erred = False
     with sigterm_interrupts():
         try:
             while waiting or running:
@@ -158,28 +123,29 @@ def run(
                     running[engine.submit(job)] = job
                     waiting.remove(job)
                 for future in wait(running, POLL, FIRST_COMPLETED).done:
-                    job = running[future]
-                    try:
-                        result = engine.result(job, future)
-                    except Exception as error:
-                        if failed is None:
-                            raise
-                        failed(job, error)
+                    job, error = running[future], future.exception()
+                    if error is not None:
+                        erred, said = True, engine.explain(job, error)
+                        if failed is None or not isinstance(said, Exception):
+                            raise said
+                        failed(job, said)
+                    elif isinstance(result := future.result(), Stopped):
+                        raise KeyboardInterrupt(result.text)
                     else:
-                        if isinstance(result, Stopped):
-                            raise KeyboardInterrupt(result.text)
                         ended(job, result)
                     if job.program:
                         warm.add(job.program)
                     del running[future]
-                engine.check()
+                if engine.heartbeat.asked_to_stop():
+                    raise KeyboardInterrupt
         except BaseException as error:
-            said = _stop(engine, running)
+            texts = _stop(engine, running)
             if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt("\n".join(said)) from None
+                raise KeyboardInterrupt("\n".join(texts)) from None
             raise
         finally:
-            engine.close()
+            engine.end()
+            engine.heartbeat.close(keep=erred)
 
 
 def _ready(waiting: list[Job], running: list[Job], warm: set[str]) -> list[Job]:
@@ -202,10 +168,17 @@ def _filled(path: Path | None) -> bool:
 
 
 def _stop(engine: Engine, running: dict[Future[Any], Job]) -> list[str]:
-    """Texts of the jobs that were asked to save and stop. A second Ctrl-C does not wait for them."""
+    """Asks the workers to save and to stop, and waits for those that have begun; texts of what the jobs said.
+
+    A second Ctrl-C ends the workers at once.
+    """
     try:
-        engine.stop(running, at_once=False)
+        engine.heartbeat.stop()
+        until = time.monotonic() + SAVING
+        while time.monotonic() < until and engine.heartbeat.busy():
+            wait(running, 0.2)
+        wait(running, 1.0)  # results under way
     except KeyboardInterrupt:
-        engine.stop(running, at_once=True)
-    ends = [f.result() for f in running if f.done() and not f.cancelled() and f.exception() is None]
+        engine.heartbeat.close(keep=True)
+    ends = [f.result() for f in running if f.done() and f.exception() is None]
     return [end.text for end in ends if isinstance(end, Stopped) and end.text]

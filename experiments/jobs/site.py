@@ -75,6 +75,16 @@ class Workers:
 ALONE = Workers()
 
 
+def count_processes(jobs: int, asked: int | None, alone: bool) -> int:
+    """Processes of this machine for so many jobs: as many as were asked for; else one per core.
+
+    One where a job should be ``alone``, or on an accelerator. Call it when JAX is configured.
+    """
+    if asked is None:
+        asked = 1 if alone or jax.default_backend() != "cpu" else len(os.sched_getaffinity(0))
+    return min(asked, jobs)
+
+
 class PoolEngine(Engine):
     """Processes of this machine, each on its share of the cores."""
 
@@ -91,9 +101,14 @@ class PoolEngine(Engine):
         self._pool = ProcessPoolExecutor(processes, context, worker.start_local, (shares,))
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        return self._pool.submit(function, *arguments)
+        try:
+            return self._pool.submit(function, *arguments)
+        except BrokenProcessPool as error:  # of which a process was killed in another job
+            done: Future[Any] = Future()
+            done.set_exception(error)
+            return done
 
-    def _explain(self, job: Job, error: BaseException) -> BaseException:
+    def explain(self, job: Job, error: BaseException) -> BaseException:
         if not isinstance(error, BrokenProcessPool):
             return error
         return RunError(
@@ -101,7 +116,7 @@ class PoolEngine(Engine):
             "The same command continues, --processes with fewer needs less memory"
         )
 
-    def _end(self) -> None:
+    def end(self) -> None:
         self._pool.shutdown(cancel_futures=True)
 
 
@@ -122,12 +137,12 @@ class ParslEngine(Engine):
                     retries=site.retries,
                     # In retries: one for a lost worker, more than there are for a job's own error.
                     retry_handler=lambda error, _: 1.0 if _lost(error) else site.retries + 1.0,
-                    run_dir=str(self._heartbeat.folder / "parsl"),
+                    run_dir=str(self.heartbeat.folder / "parsl"),
                     strategy_period=2.0,
                 )
             )
         except Exception as error:  # as which its providers raise what sbatch says differs
-            self._heartbeat.close(keep=True)
+            self.heartbeat.close(keep=True)
             raise ConfigError(f"{where}: provider.kind {site.provider.kind}: {error}") from None
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -135,10 +150,10 @@ class ParslEngine(Engine):
             function, app_args=arguments, executors="all", cache=False, ignore_for_cache=None, app_kwargs={}
         )
 
-    def _explain(self, job: Job, error: BaseException) -> BaseException:
+    def explain(self, job: Job, error: BaseException) -> BaseException:
         from parsl.executors.errors import BadStateException
 
-        logs = f"logs: {self._heartbeat.folder}"
+        logs = f"logs: {self.heartbeat.folder}"
         if _lost(error):
             return RunError(
                 f"{job.name}: lost its worker {self._site.retries + 1} times (the last: {error}); {logs}. "
@@ -148,7 +163,7 @@ class ParslEngine(Engine):
             RunError(f"the site gives no workers: {error}; {logs}") if isinstance(error, BadStateException) else error
         )
 
-    def _end(self) -> None:
+    def end(self) -> None:
         self._kernel.cleanup()
 
 

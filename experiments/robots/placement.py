@@ -54,15 +54,6 @@ BOX = ((-1.0, 1.0), (-3.0, -1.6), (-0.7, 0.3))  # [m] where the MJCF's origin ma
 
 
 @dataclass(frozen=True)
-class Found:
-    """The best candidate, its score and that of the robot as it was."""
-
-    robot: Robot
-    score: float
-    before: float
-
-
-@dataclass(frozen=True)
 class Meetings:
     """Places where balls can be met: time (B, K) [s], position [m] and wanted normal (B, K, 3) of the blade."""
 
@@ -71,8 +62,8 @@ class Meetings:
     normal: np.ndarray
 
 
-def search(robot: Robot, balls: Balls, samples: int, seed: int) -> Found:
-    """The best mounting and home pose found for ``samples`` balls of the distribution."""
+def search(robot: Robot, balls: Balls, samples: int, seed: int) -> tuple[Robot, float, float]:
+    """The robot at the best mounting and home pose found for ``samples`` balls, its score and that from before."""
     places = meetings(robot, balls, samples, seed)
     poses = inverse_kinematics(robot, places)
     limits = robot.contract.limits
@@ -94,7 +85,7 @@ def search(robot: Robot, balls: Balls, samples: int, seed: int) -> Found:
         mean, std = drawn[order].mean(axis=0), drawn[order].std(axis=0) + 0.01
         if scores[order[0]] > best_score:
             best, best_score = drawn[order[0]], float(scores[order[0]])
-    return Found(placed(robot, best), best_score, before)
+    return placed(robot, best), best_score, before
 
 
 def placed(robot: Robot, candidate: np.ndarray) -> Robot:
@@ -219,10 +210,9 @@ def write(robot: Robot, source: Path, target: Path) -> None:
     robots.load(target)
 
 
-def description(before: Robot, found: Found) -> Iterator[str]:
+def description(before: Robot, now: Robot) -> Iterator[str]:
     """Lines that say what changed."""
-    yield f"score {found.before:.3f} -> {found.score:.3f} (share of balls that can be met in time)"
-    for name, robot in (("before", before), ("now", found.robot)):
+    for name, robot in (("before", before), ("now", now)):
         position, normal, _ = blade(robot)
         yield (
             f"{name}: base at {list(robot.file.position)} m, yaw {robot.file.yaw:.3f} rad; blade at "

@@ -32,8 +32,7 @@ def save(folder: Path, update: int, tree: Any, notes: dict[str, Any]) -> Path:
     """
     path = folder / f"{update:08d}.npz"
     # Any: a keyword of savez may also be one of its options.
-    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(held_here(tree))}
-    arrays[NOTES] = np.array(json.dumps(notes | {"update": update}))
+    arrays: dict[str, Any] = pack(tree) | {NOTES: np.array(json.dumps(notes | {"update": update}))}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, open(temporary, "wb") as file:
@@ -61,20 +60,31 @@ def load_latest(folder: Path, template: Tree) -> tuple[Tree, dict[str, Any]] | N
     found = read_latest(folder)
     if found is None:
         return None
-    arrays, notes = found
-    template = held_here(template)
-    names = [name for name, _ in _named_leaves(template)]
-    if set(names) != set(arrays):
-        raise CheckpointError(f"{folder}: holds {sorted(arrays)}, this program's state is {sorted(names)}")
+    return unpack(found[0], template, str(folder)), found[1]
+
+
+def pack(tree: Any) -> dict[str, np.ndarray]:
+    """The leaves of a tree by their paths in it, random keys as their data."""
+    return {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(tree).items()}
+
+
+def unpack(arrays: dict[str, np.ndarray], template: Tree, where: str) -> Tree:
+    """The tree of packed leaves, shaped as ``template``; ``where`` they are from.
+
+    Raises CheckpointError where they are another program's.
+    """
+    wanted = _named_leaves(template)
+    if set(wanted) != set(arrays):
+        raise CheckpointError(f"{where}: holds {sorted(arrays)}, this program's state is {sorted(wanted)}")
     leaves = []
-    for name, leaf in _named_leaves(template):
-        wanted = _data(leaf)
-        if arrays[name].shape != wanted.shape or arrays[name].dtype != wanted.dtype:
-            given = f"{arrays[name].dtype} {arrays[name].shape}"
-            raise CheckpointError(f"{folder}: {name} is {given}, wanted is {wanted.dtype} {wanted.shape}")
-        array = jax.numpy.asarray(arrays[name])
+    for name, leaf in wanted.items():
+        found, like = arrays[name], _data(leaf)
+        if (found.shape, found.dtype) != (like.shape, like.dtype):
+            given = f"{found.dtype} {found.shape}"
+            raise CheckpointError(f"{where}: {name} is {given}, wanted is {like.dtype} {like.shape}")
+        array = jnp.asarray(found)
         leaves.append(jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else array)
-    return jax.tree.unflatten(jax.tree.structure(template), leaves), notes
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def read_latest(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
@@ -105,9 +115,9 @@ def _paths(folder: Path) -> list[Path]:
     return sorted(folder.glob("[0-9]*.npz"))
 
 
-def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
-    paths, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return [(jax.tree_util.keystr(path).removeprefix("."), leaf) for path, leaf in paths]
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(held_here(tree))
+    return {jax.tree_util.keystr(path).removeprefix("."): leaf for path, leaf in leaves}
 
 
 def _is_key(leaf: Any) -> bool:

@@ -13,21 +13,7 @@ from robot_io.policy.artefact import MANIFEST
 SHIPPED = Path(__file__).parents[1] / "shipped" / "policies"
 SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
 LISTED = 6  # folders that a message names
-_MARKS = (
-    f"*/{MANIFEST}",
-    *(
-        f"{place}/{CONFIG}"
-        for place in (
-            "*",
-            "training/*",
-            "*/training/*",
-            "player*/*",
-            "player*/*/training/*",
-            "seed*/player*/*",
-            "seed*/player*/*/training/*",
-        )
-    ),
-)
+_RUNS = "* training/* */training/* player*/* player*/*/training/* seed*/player*/* seed*/player*/*/training/*".split()
 
 
 def find_policy(folder: str | Path) -> Path:
@@ -73,7 +59,8 @@ def _inside(folder: Path) -> str:
     """Which runs or artefacts lie in a folder that is neither, for a message; of several trainings the chosen one."""
     if not folder.is_dir():
         return "; there is no such folder"
-    found = [path.parent for marks in _MARKS for path in sorted(folder.glob(marks)) if path.parent != folder]
+    marks = (f"*/{MANIFEST}", *(f"{place}/{CONFIG}" for place in _RUNS))
+    found = [path.parent for mark in marks for path in sorted(folder.glob(mark)) if path.parent != folder]
     chosen = {}  # the folder with the choice: what was chosen
     for place in {folder, *(parent for run in found for parent in run.parents if folder in parent.parents)}:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):

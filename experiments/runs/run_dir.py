@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import hashlib
 import json
 import platform
 import subprocess
@@ -103,15 +102,8 @@ class Run:
 
     def _untouched(self) -> bool:
         """True where the folder holds no more than the records of a start: no checkpoint, no measurement."""
-        kept = {
-            CONFIG,
-            SESSIONS,
-            LOCK,
-            self.output.name,
-            self.checkpoints.name,
-            self.metrics.name,
-            self.tensorboard.name,
-        }
+        made = (self.output, self.checkpoints, self.metrics, self.tensorboard)
+        kept = {CONFIG, SESSIONS, LOCK, *(path.name for path in made)}
         if any(path.name not in kept for path in self.folder.iterdir()):
             return False
         measured = self.metrics.exists() and self.metrics.stat().st_size > 0
@@ -182,12 +174,6 @@ def training_ended(config: Config, update: int, seconds: float, return_rate: flo
     return None
 
 
-def digest(config: Config) -> str:
-    """SHA-256 of everything that decides what the updates compute."""
-    kept = {key: value for key, value in _flat(config.to_dict()).items() if not _changeable(key)}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
-
-
 def provenance() -> dict[str, Any]:
     """Time, versions and commit, as plain data."""
     return {
@@ -201,9 +187,14 @@ def provenance() -> dict[str, Any]:
 
 def git_state() -> dict[str, Any] | None:
     """Commit of the program's source and whether files differ from it; None outside a repository."""
-    root = Path(__file__).parents[2]
-    commit, changes = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--untracked-files=no")
-    return None if commit is None else {"commit": commit, "modified": bool(changes)}
+    asked = ("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no")
+    git = "git", "-C", str(Path(__file__).parents[2])
+    try:
+        runs = [subprocess.run([*git, *a], capture_output=True, text=True, timeout=10, check=True) for a in asked]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    commit, changes = (run.stdout.strip() for run in runs)
+    return {"commit": commit, "modified": bool(changes)}
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -222,14 +213,6 @@ def write_csv(path: Path, head: Sequence[str], rows: Iterable[Iterable[Any]]) ->
     """Replaces the file by a table, whole or not at all. Raises OSError."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows((head, *rows))
-
-
-def _git(root: Path, *arguments: str) -> str | None:
-    try:
-        result = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return result.stdout.strip() if result.returncode == 0 else None
 
 
 def _version(package: str) -> str | None:

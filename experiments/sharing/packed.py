@@ -80,10 +80,14 @@ def read(path: Path) -> dict[str, bytes]:
     raw = path.read_bytes()
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            _check_names(path, [info.filename for info in archive.infolist()])
-            contents = {info.filename: _member(path, archive, info) for info in archive.infolist()}
+            _check_names(path, archive.namelist())
+            for info in archive.infolist():
+                if info.compress_type != zipfile.ZIP_STORED or info.file_size > LARGEST:
+                    given = f"{info.file_size:,} bytes by method {info.compress_type}"
+                    raise PackError(f"{path}: {info.filename}: {given}; {_RECOPY}")
+            contents = {name: archive.read(name) for name in archive.namelist()}
     except _DAMAGE as error:
-        raise PackError(f"{path}: no packed policy, or its table of contents is damaged ({error}); {_RECOPY}") from None
+        raise PackError(f"{path}: no packed policy, or a damaged one ({error}); {_RECOPY}") from None
     head, *rows = contents[SUMS].decode("ascii", "replace").splitlines(keepends=True)
     if head != HEADER:
         raise PackError(f"{path}: {SUMS}: begins with {head!r}, expected {HEADER!r}; {_RECOPY}, or update mjx-tt")
@@ -162,15 +166,6 @@ def _check_names(path: Path, names: list[str]) -> None:
     ]
     if complaints:
         raise PackError(f"{path}: {'; '.join(complaints)}; {_RECOPY}")
-
-
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    if info.compress_type != zipfile.ZIP_STORED or info.file_size > LARGEST:
-        raise PackError(f"{path}: {info.filename}: {info.file_size:,} bytes by method {info.compress_type}; {_RECOPY}")
-    try:
-        return archive.read(info)
-    except _DAMAGE as error:
-        raise PackError(f"{path}: {info.filename}: damaged ({error}); {_RECOPY}") from None
 
 
 def _member_at(packed: bytes, place: int) -> str:

@@ -10,7 +10,6 @@ from contextlib import nullcontext
 from typing import Any, NoReturn
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.stages import Compiled
 from numpy.typing import ArrayLike
@@ -23,22 +22,42 @@ from experiments.config.experiment import Config
 from experiments.errors import CheckpointError, ConfigError, RunError, error_context
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.interrupts import stop_requested
+from experiments.progress import TrainingProgress
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
-from experiments.training.progress import TrainingProgress
+from experiments.training.first_order import FirstOrderTrainer
 from experiments.training.ranks import SINGLE, Ranks, Watchdog
-from experiments.training.trainers import trainer
 from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import held_here
+from mjx_tt.env.rollout import Simulator, held_here
 from mjx_tt.sim import arguments
 
 _programs: dict[str, Compiled] = {}  # compiled updates by what decides them
 CTRL_C = "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
+KINDS: dict[str, type[Trainer]] = {"zeroth_order": Trainer, "first_order": FirstOrderTrainer}  # by optimiser.gradient
 QUEUED = 16  # updates between fetches where several devices take part: hundreds of queued collectives may hang
+
+
+def make_trainer(experiment: Experiment) -> Trainer:
+    """The trainer that an experiment asks for, with its pool of balls drawn. Raises ConfigError."""
+    config = experiment.config
+    with error_context("training.devices"):
+        simulator = Simulator(experiment.task, build.device_count(config))
+    return KINDS[config.optimiser.gradient](
+        simulator,
+        experiment.bgs,
+        build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool),
+        experiment.model.model,
+        experiment.model.randomise,
+        config.optimiser.repeats,
+        config.optimiser.common_random_numbers,
+        config.optimiser.initial_scale,
+        build.later_weights(config),
+        experiment.network,
+    )
 
 
 def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> str:
@@ -71,7 +90,7 @@ class TrainingRun:
 
     def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> None:
         self._config, self._run, self._console, self._ranks = experiment.config, run, console, ranks
-        self._trainer = trainer(experiment)
+        self._trainer = make_trainer(experiment)
         self.state, notes = _start(self._config, run, self._trainer, ranks)
         self.update, self.seconds, self.return_rate = notes["update"], notes["seconds"], notes["return_rate"]
         self._saved = (self.update, time.monotonic())
@@ -265,18 +284,10 @@ def _broadcast(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[
     """The first process' state and notes, which alone reads the run's folder."""
     if ranks.is_alone:
         return state, notes
-    leaves, tree = jax.tree.flatten(held_here(state))
-    keys = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
-    arrays = [np.asarray(jax.random.key_data(x) if is_key else x) for x, is_key in zip(leaves, keys, strict=True)]
     rate = np.nan if notes["return_rate"] is None else notes["return_rate"]
-    *arrays, numbers = ranks.broadcast([*arrays, np.array([notes["update"], notes["seconds"], rate])])
-    whole = [
-        jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(leaf)) if is_key else jnp.asarray(x)
-        for x, leaf, is_key in zip(arrays, leaves, keys, strict=True)
-    ]
-    update, seconds, rate = numbers
-    found = {"update": int(update), "seconds": float(seconds), "return_rate": None if np.isnan(rate) else float(rate)}
-    return jax.tree.unflatten(tree, whole), found
+    update, seconds, rate = ranks.gather(notes["update"], notes["seconds"], rate)[0].tolist()
+    state = checkpoint.unpack(ranks.broadcast(checkpoint.pack(state)), state, "process 0")
+    return state, {"update": int(update), "seconds": seconds, "return_rate": None if np.isnan(rate) else rate}
 
 
 def _round(value: ArrayLike) -> float | None:

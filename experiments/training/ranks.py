@@ -49,16 +49,14 @@ class Ranks:
         mine = np.array(values, np.float64)[None]
         return mine if self.is_alone else _gather_bytes(mine.view(np.uint8)).view(np.float64)
 
-    def broadcast(self, arrays: list[np.ndarray]) -> list[np.ndarray]:
+    def broadcast(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The first process' arrays in place of each one's own, which have the same shapes and types."""
-        if self.is_alone:
-            return arrays
-        mine = np.frombuffer(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), np.uint8)
-        theirs, out, start = _gather_bytes(mine[None])[0].tobytes(), [], 0
-        for a in arrays:
-            out.append(np.frombuffer(theirs, a.dtype, a.size, start).reshape(a.shape))
-            start += a.nbytes
-        return out
+
+        def first(mine: np.ndarray) -> np.ndarray:
+            every = _gather_bytes(np.frombuffer(mine.tobytes(), np.uint8)[None])
+            return np.frombuffer(every[0].tobytes(), mine.dtype).reshape(mine.shape)
+
+        return arrays if self.is_alone else {name: first(array) for name, array in arrays.items()}
 
     def disconnect(self) -> None:
         """Ends the common work, for which each one waits; afterwards every process has its own devices only."""

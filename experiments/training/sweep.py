@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -19,7 +17,7 @@ from experiments.config import build
 from experiments.config.experiment import Config
 from experiments.errors import ConfigError, RunError, explained
 from experiments.evaluation import evaluate
-from experiments.jobs import engine
+from experiments.jobs import engine, site
 from experiments.jobs.engine import Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.progress import make_console
@@ -68,18 +66,14 @@ def plan(configs: list[tuple[str, Config]], seeds: tuple[int, ...], out: Path) -
     return jobs
 
 
-def choose(jobs: list[Job], processes: int | None, devices: int | None) -> int:
-    """Number of processes for a batch: ``processes`` where it is given, else one per core, and no more than jobs.
+def count_processes(jobs: list[Job], asked: int | None, devices: int | None) -> int:
+    """Number of processes for a batch; one where a number of ``devices`` is asked for. Call it when JAX is configured.
 
-    On an accelerator, for one job, or where a number of devices is asked for, one does them all. It follows from the
-    whole batch, not from what is left of it: it decides the devices of each, and these the last bits. Call it when JAX
-    is configured.
+    It follows from the whole batch, not from what is left of it: it decides the devices of each, and these the last
+    bits.
     """
-    if processes is not None:
-        return min(processes, len(jobs))
-    if devices is not None or len(jobs) == 1 or any(job.config.training.devices != "auto" for job in jobs):
-        return 1
-    return min(len(os.sched_getaffinity(0)), len(jobs)) if jax.default_backend() == "cpu" else 1
+    fixed = devices is not None or any(job.config.training.devices != "auto" for job in jobs)
+    return site.count_processes(len(jobs), asked, alone=fixed)
 
 
 def run_all(jobs: list[Job], console: Console, out: Path, workers: Workers = ALONE) -> bool:
@@ -89,56 +83,58 @@ def run_all(jobs: list[Job], console: Console, out: Path, workers: Workers = ALO
     folder. out: folder of the runs. Raises KeyboardInterrupt when it was stopped, ConfigError for a site that cannot be
     used.
     """
+    by_name = {str(job.run.folder): job for job in jobs}
+    outcomes: dict[str, tuple[str, str]] = {}  # "done" or "failed", and the return rate or the error
     if not workers.alone:
-        return _run_side_by_side(jobs, console, out, workers)
-    outcomes: list[tuple[Job, str, str]] = []
-    for job in jobs:
+        _run_side_by_side(by_name, console, out, workers, outcomes)
+    for name, job in by_name.items() if workers.alone else ():
         try:
-            result, failed = run_job(job, console), False
+            outcomes[name] = "done", run_job(job, console)
         except Exception as error:  # even a bug in one job must not cost the night's other trainings
             if explained(error):
                 console.print(f"error: {error}", style="red", soft_wrap=True)
             else:
                 console.print_exception()
-            result, failed = f"{type(error).__name__}: {error}".splitlines()[0], True
-        outcomes.append((job, "failed" if failed else "done", result))
-    if len(jobs) > 1:
-        _print_outcomes(outcomes, console)
-    return all(state == "done" for _, state, _ in outcomes)
+            outcomes[name] = "failed", f"{type(error).__name__}: {error}".splitlines()[0]
+    if len(jobs) > 1 or not workers.alone:
+        table = Table("run", "", "return rate or error", title="Summary", title_justify="left")
+        for name in by_name:
+            state, result = outcomes[name]
+            table.add_row(name, Text(state, "green" if state == "done" else "red"), result)
+        console.print(table)
+    return all(state == "done" for state, _ in outcomes.values())
 
 
-def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Workers) -> bool:
-    by_name = {str(job.run.folder): job for job in jobs}
-    outcomes: dict[str, tuple[Job, str, str]] = {}
-
+def _run_side_by_side(
+    jobs: dict[str, Job], console: Console, out: Path, workers: Workers, outcomes: dict[str, tuple[str, str]]
+) -> None:
     def note(name: str, state: str, result: str) -> None:
-        outcomes[name] = (by_name[name], state, result)
+        outcomes[name] = state, result
         line = f"[{len(outcomes)}/{len(jobs)}] {name}: {'' if state == 'done' else 'failed: '}{result}"
         console.print(line, style="red" if state == "failed" else None, soft_wrap=True)
 
     left = []
-    for name, job in by_name.items():
+    for name, job in jobs.items():
         if job.run.done(job.config):
             note(name, "done", run_job(job, console))
         else:
             # Runs of one program: the first compiles it for all.
             program = hashlib.sha256(loop.program(job.config, job.config.training.devices).encode()).hexdigest()
             left.append(engine.Job(name, (job,), program=program, compiled=job.run.metrics))
-    if left:
-        console.print(
-            f"{len(left)} runs, {workers.text}; each writes its lines to {jobs[0].run.output.name} in its folder",
-            soft_wrap=True,
-        )
-        asked = max((c.devices for c in (job.config.training for job in jobs) if c.devices != "auto"), default=1)
-        setup = Setup("experiments.training.sweep:prepare", (), max(asked, workers.cores))
-        engine.run(
-            workers.engine(setup, out),
-            left,
-            lambda job, result: note(job.name, "done", result),
-            lambda job, error: note(job.name, "failed", str(error)),
-        )
-    _print_outcomes([outcomes[name] for name in by_name], console)
-    return all(state == "done" for _, state, _ in outcomes.values())
+    if not left:
+        return
+    output = next(iter(jobs.values())).run.output.name
+    console.print(f"{len(left)} runs, {workers.text}; each writes its lines to {output} in its folder", soft_wrap=True)
+    devices = max(
+        [workers.cores, *(c.devices for c in (j.config.training for j in jobs.values()) if c.devices != "auto")]
+    )
+    setup = Setup("experiments.training.sweep:prepare", (), devices)
+    engine.run(
+        workers.engine(setup, out),
+        left,
+        lambda job, result: note(job.name, "done", result),
+        lambda job, error: note(job.name, "failed", str(error)),
+    )
 
 
 def prepare() -> Callable[[Job], str]:
@@ -221,10 +217,3 @@ def select(
     console.print(
         f"{folder}: best seed by {EPISODES} episodes on {robot or 'the simulation'}: {best} ({scores[best]:.2f} of 2)"
     )
-
-
-def _print_outcomes(outcomes: list[tuple[Job, str, str]], console: Console) -> None:
-    table = Table("run", "", "return rate or error", title="Summary", title_justify="left")
-    for job, state, result in outcomes:
-        table.add_row(str(job.run.folder), Text(state, "green" if state == "done" else "red"), result)
-    console.print(table)

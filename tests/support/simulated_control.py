@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import threading
 from functools import partial
 from types import SimpleNamespace
 
@@ -70,6 +71,17 @@ class Simulated:
         options = {"artefact": artefact and str(artefact), "backend": "numpy", "balls_needed": 0} | options
         self.control = Control(config, ControlOptions(**options), theirs)
         self.simulation.bridge = self.control.bridge
+
+    def thread(self, monkeypatch):
+        """A thread, not yet started, that is the process of the next session."""
+
+        def control():
+            with self.control:
+                self.control.run()
+
+        thread = threading.Thread(target=control, daemon=True)
+        monkeypatch.setattr(process, "start", lambda *_: (thread, self.pipe))
+        return thread
 
     def _sleep(self, seconds):
         self.simulation.advance()

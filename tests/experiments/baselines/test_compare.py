@@ -15,12 +15,12 @@ from rich.console import Console
 from ballmodel import registry
 from experiments.baselines import compare
 from experiments.baselines.learners import BudgetSpent, PpoLearner, SacLearner
-from experiments.config import baselines
+from experiments.config import baselines, files
 from experiments.config import experiment as config
 from experiments.config.baselines import Ppo, Sac
 from experiments.config.site import Site
 from experiments.errors import ConfigError, RunError
-from experiments.jobs.site import ALONE, Workers
+from experiments.jobs.site import Workers
 from experiments.runs import checkpoint
 from mjx_tt.env.brax import OBSERVATION_SIZE
 from robot_io.contract import N_JOINTS
@@ -118,11 +118,18 @@ def write(folder, data):
     return path
 
 
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """The YAML and the folder of a comparison by this process alone."""
+    folder = tmp_path_factory.mktemp("alone")
+    path = write(folder, SMALL)
+    return path, compare.compare(*baselines.load(path), str(path), folder, Console())
+
+
 @pytest.mark.slow
-def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
-    path, console = write(tmp_path, SMALL), Console()
-    folder = compare.compare(*baselines.load(path), str(path), tmp_path, console)
-    run = folder / "ES" / "seed0"
+def test_a_comparison_runs_resumes_and_refuses(compared, capsys):
+    (path, folder), console = compared, Console()
+    out, run = folder.parent, folder / "ES" / "seed0"
     training = json.loads((run / "training.json").read_text())
     assert [point["episodes"] for point in training["curve"]] == [0, 24, 40]  # 8 an update; after a half and the whole
     report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
@@ -132,12 +139,12 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
         assert (folder / name).stat().st_size > 0
 
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
-    compare.compare(*baselines.load(path), str(path), tmp_path, console)
+    compare.compare(*baselines.load(path), str(path), out, console)
     assert "skipped" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
 
     def missing(*overrides):
-        return compare.unfinished(compare.prepare(*baselines.load(path, overrides), str(path), tmp_path, console))
+        return compare.unfinished(compare.prepare(*baselines.load(path, overrides), str(path), out, console))
 
     assert missing() == {"ES": []}
     assert missing("seeds=[0, 3]") == {"ES": [3]}
@@ -216,15 +223,15 @@ def test_an_algorithm_trains_in_a_world_of_its_own_and_is_judged_in_that_of_all(
             compare.prepare(*baselines.load(path, (f"algorithms.own.{override}",)), str(path), tmp_path, Console())
 
 
-@pytest.mark.parametrize("name", baselines.shipped())
+@pytest.mark.parametrize("name", files.shipped("compare"))
 def test_a_shipped_comparison_is_valid(name):
-    comparison, experiment = baselines.load(baselines.shipped()[name])
+    comparison, experiment = baselines.load(files.find_shipped(name, "compare"))
     assert comparison.name == name
 
 
 def test_the_pillars_change_elites_and_orthogonality_of_the_papers_settings_alone():
-    comparison, experiment = baselines.load(baselines.shipped()["compare_pillars"])
-    paper = config.load(config.shipped()["paper"])
+    comparison, experiment = baselines.load(files.find_shipped("compare_pillars", "compare"))
+    paper = config.load(files.find_shipped("paper", "train"))
     assert (experiment.task, experiment.model) == (paper.task, paper.model)
     rows = {name: learning.optimiser for name, learning in comparison.algorithms.items()}
     assert rows["difference-orthogonal"] == paper.optimiser
@@ -238,13 +245,12 @@ def test_the_pillars_change_elites_and_orthogonality_of_the_papers_settings_alon
 
 
 @pytest.mark.slow
-def test_a_site_trains_the_same(tmp_path):
+def test_a_site_trains_the_same(compared, tmp_path):
     """In this process, and by a worker of Parsl's: the same policies, curves and evaluations."""
-    path = write(tmp_path, SMALL | {"seeds": [1]})
+    path, folder = compared
     here = Site.model_validate({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0})
-    for out, workers in (("alone", ALONE), ("site", Workers(1, here, "here.yaml"))):
-        compare.compare(*baselines.load(path), str(path), tmp_path / out, Console(), workers)
-    alone, site = (tmp_path / out / "small" / "ES" / "seed1" for out in ("alone", "site"))
+    compare.compare(*baselines.load(path), str(path), tmp_path, Console(), Workers(1, here, "here.yaml"))
+    alone, site = (place / "ES" / "seed0" for place in (folder, tmp_path / "small"))
     arrays, others = (checkpoint.read_latest(folder / "policy")[0] for folder in (alone, site))
     assert arrays.keys() == others.keys() and len(arrays) > 0
     assert all(arrays[name].tobytes() == others[name].tobytes() for name in arrays)

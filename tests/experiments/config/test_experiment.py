@@ -1,8 +1,9 @@
-"""Experiment YAMLs: what is shipped loads, and a mistake is named with its place and the way out."""
+"""YAMLs of experiments, sites and fine-tunings: a mistake is named with its place and the way out."""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 
 import jsonschema
@@ -10,10 +11,12 @@ import pytest
 import yaml
 
 from ballmodel import registry
-from experiments.config import build, files
+from ballmodel.io import validation
+from experiments.config import build, experiment, files, finetuning, site
 from experiments.config import experiment as config
 from experiments.config.prior import PRIOR
 from experiments.errors import ConfigError
+from experiments.jobs.site import accelerators
 
 SMALLEST = {"name": "a", "balls": "narrow"}
 
@@ -35,9 +38,9 @@ def complaint(data: dict) -> str:
     return str(raised.value)
 
 
-@pytest.mark.parametrize("path", config.shipped().values(), ids=config.shipped().keys())
+@pytest.mark.parametrize("path", files.shipped("train").values(), ids=files.shipped("train"))
 def test_shipped_experiments_load_and_fit_the_schema(path):
-    jsonschema.validate(files.read_yaml(path.read_text(), str(path)), config.json_schema())
+    jsonschema.validate(files.read_yaml(path.read_text(), str(path)), validation.json_schema(config.Config))
     loaded = config.load(path)
     assert loaded.name == path.stem
     build.experiment(loaded, str(path))
@@ -117,7 +120,7 @@ def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_curr
 
 def test_paper_settings_are_the_papers():
     """The table of hyper-parameters in the paper's appendix."""
-    built = build.experiment(config.load(config.shipped()["paper"]), "paper")
+    built = build.experiment(config.load(files.find_shipped("paper", "train")), "paper")
     bgs = built.bgs
     assert (bgs.num_directions, bgs.sigma, bgs.elite_fraction, bgs.orthogonal, bgs.ema_decay) == (
         200,
@@ -126,16 +129,16 @@ def test_paper_settings_are_the_papers():
         True,
         0.0,
     )
-    paper = config.load(config.shipped()["paper"])
+    paper = config.load(files.find_shipped("paper", "train"))
     assert paper.optimiser.repeats == 15
     assert built.task.sim_rate == 300 and built.task.contact_ends_episode
     assert built.model.model.ball.flight.integrator == "paper"
     drawn = {one.path: [one.low, one.high] for one in built.model.randomise}  # dynamics; latencies and noise as printed
     assert drawn["ball.table.restitution"] == [0.88, 0.98] and drawn["drives.joint_2.lag"] == [0.0, 0.025]
     assert len(drawn) == 4 + 2 * 8 and drawn.items() <= PRIOR.items()
-    assert config.load(config.shipped()["paper_mjx"], ("task.engine=fused", "name=paper")) == paper
-    assert config.load(config.shipped()["paper_mjx"]).task.engine == "mjx"
-    falling = config.load(config.shipped()["quickstart"], ("optimiser.sigma_fall={final: 0.01}",))
+    assert config.load(files.find_shipped("paper_mjx", "train"), ("task.engine=fused", "name=paper")) == paper
+    assert config.load(files.find_shipped("paper_mjx", "train")).task.engine == "mjx"
+    falling = config.load(files.find_shipped("quickstart", "train"), ("optimiser.sigma_fall={final: 0.01}",))
     sigma = build.experiment(falling, "quickstart").bgs.sigma
     assert (sigma(0), sigma(falling.training.updates)) == (0.025, pytest.approx(0.01))
     change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
@@ -158,3 +161,63 @@ def test_the_prior_is_drawn_where_a_model_names_it(tmp_path):
         build.experiment(other, str(file))
     file.write_text("name: a\nballs: narrow\nrobot: ur10e_rail\n")
     assert build.unknown_worlds(build.experiment(config.load(file), str(file))) is None
+
+
+CORES = len(os.sched_getaffinity(0))
+SLURM = {"provider": {"kind": "slurm", "walltime": "01:30:00"}, "workers_per_node": 16}
+LOCAL = {"provider": {"kind": "local"}, "workers_per_node": 1}
+
+
+def write(folder, data):
+    path = folder / "cluster.yaml"
+    path.write_text(data if isinstance(data, str) else yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (SLURM | {"worker_per_node": 2}, r"worker_per_node: expected .*; did you mean 'workers_per_node'\?"),
+        (SLURM | {"provider": {"kind": "slurn"}}, r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'"),
+        (
+            SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
+            r"provider\.walltime: expected hours:minutes:seconds in quotes.*, got '90'",
+        ),
+        (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
+        (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
+        ("- slurm", r"cluster.yaml: expected a mapping, got \['slurm'\]"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path, data, message):
+    path = write(tmp_path, data)
+    with pytest.raises(ConfigError, match=message) as error:
+        site.load(path)
+    assert all("cluster.yaml" in line for line in str(error.value).splitlines())
+
+
+def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
+    two = site.load(write(tmp_path, SLURM | {"workers_per_node": 2, "accelerators_per_worker": 2}))
+    assert accelerators(two) == ["0,1", "2,3"]
+    assert accelerators(site.load(write(tmp_path, SLURM))) == []
+
+
+def shipped(name: str) -> experiment.Config:
+    return experiment.load(files.find_shipped(name, "train"))
+
+
+def test_defaults_are_the_papers_but_for_policies_by_first_order_gradients():
+    for trained in (None, shipped("quickstart")):
+        settings = finetuning.load(trained=trained)
+        assert (settings.sigma, settings.step.learning_rate) == (0.025, 0.00375)
+    settings = finetuning.load(trained=shipped("robust"))
+    assert (settings.sigma, settings.step.learning_rate) == (0.01, 0.0015)
+    # The step of both is the same share of the perturbation, and all else is alike.
+    assert settings.sigma / settings.step.learning_rate == pytest.approx(0.025 / 0.00375)
+    assert settings.model_copy(update={"sigma": 0.025, "step": finetuning.FineTuning().step}) == finetuning.FineTuning()
+
+
+def test_own_settings_come_before_both(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text("sigma: 0.02\n")
+    settings = finetuning.load(path, ("step.learning_rate=0.001",), shipped("robust"))
+    assert (settings.sigma, settings.step.learning_rate) == (0.02, 0.001)

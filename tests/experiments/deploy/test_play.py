@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -145,9 +144,9 @@ def summary_of(folder):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_ends_with_the_summary(policy, tmp_path, number):
-    """Ctrl-C, an orderly shutdown, a terminal that closes."""
+    """Ctrl-C, a terminal that closes; SIGTERM stands in one list with them."""
     with started(policy, tmp_path) as running:
         os.killpg(running.pid, number)  # the whole group, as a terminal does
         text = running.stdout.read()
@@ -241,13 +240,7 @@ def until(session, condition):
 def on_the_simulated_clock(policy, monkeypatch):
     """A simulated control process, and its session."""
     simulated = Simulated(policy, monkeypatch)
-
-    def control():
-        with simulated.control:
-            simulated.control.run()
-
-    thread = threading.Thread(target=control, daemon=True)
-    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
+    thread = simulated.thread(monkeypatch)
     monkeypatch.setattr(sessions, "SETTLE", 0.0)
     thread.start()
     with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
@@ -338,7 +331,7 @@ def test_killed_bridge_leaves_a_readable_log_and_the_arm_stops(playing):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGQUIT])
 def test_signals_never_leave_the_robot_moving(playing, number):
     """Those of a terminal's stop do nothing, the others end the process once the robot stands."""
     _, session, folder = playing

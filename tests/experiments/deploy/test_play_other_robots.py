@@ -1,4 +1,7 @@
-"""Robots with other joints than the paper's on the rig: real processes, real sockets, and what reads their logs."""
+"""Robots with other joints than the paper's on the rig: real processes, real sockets, and what reads their logs.
+
+And a shipped policy behind the gate: what keeps the robot from the table costs no returns.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,14 @@ from rich.console import Console
 from experiments.commands import diagnose
 from experiments.config import build
 from experiments.config import robot as robots
+from experiments.config.robot import throws_of
 from experiments.deploy import play
 from experiments.deploy.control_session import ControlSession
 from experiments.errors import ConfigError
+from experiments.finetuning import loop
 from experiments.finetuning.robot import LockStepRobot
 from experiments.options import RIG, RobotOptions
+from experiments.runs import load_policy
 from experiments.view import measured
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
@@ -29,8 +35,10 @@ from robot_io.control import process
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from robot_io.policy import export
+from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
 from robot_io.safety.clearance import RobotGeometry
+from tests.support.lockstep_play import lockstep
 
 FR3, UR10E = "fr3_pedestal", "ur10e_rail"
 BALLS = 3
@@ -189,3 +197,14 @@ def test_an_episode_of_fine_tuning_in_lock_step():
     learner = LockStepRobot(throws, robots.load_rig(None, robot), robot.scene(), robot.contract)
     ball = learner.play(small(robot), 0)
     assert not ball.summary.fault and ball.trajectory.shape[0] > 10 and learner.describe()["joints"] == FR3
+
+
+@pytest.mark.slow
+def test_the_quickstart_returns_behind_the_gate_what_it_returns_in_the_simulation():
+    """It swings close to the table. 97.2 % of 2,048 simulated balls; a gate that braked every joint there left 75 %."""
+    experiment = loop.experiment_of("quickstart")
+    policy = StreamingPolicy(load_policy.load("quickstart").policy.astype(np.float32))
+    robot = lockstep(policy, throws_of(experiment.distribution, experiment.model.model, 40, 0))
+    robot.start()
+    outcomes = [summary.outcome for summary in robot.play(40)]
+    assert len(outcomes) == 40 and outcomes.count("returned") >= 35  # 0.1 % of 97.2 %, below 5 % of 75 %

@@ -8,6 +8,7 @@ import math
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -228,14 +229,13 @@ def test_the_artefact_is_what_the_robot_played_last(source, tmp_path):
     np.testing.assert_allclose(inverse_scale, INVERSE_SCALE, rtol=1e-6)
 
 
-def test_the_run_can_be_trained_from_and_tuned_again(source, tmp_path):
-    tune(source, tmp_path / "first", Toy())
-    loaded = load_policy.load(tmp_path / "first")
-    theta, _ = load_policy.load_statistics(tmp_path / "first")
-    np.testing.assert_array_equal(theta, last_theta(tmp_path / "first"))
-    assert loaded.config.name == "first" and loaded.config.balls == "player3/M0"
+def test_the_run_can_be_trained_from_and_tuned_again(whole, tmp_path):
+    loaded = load_policy.load(whole)
+    theta, _ = load_policy.load_statistics(whole)
+    np.testing.assert_array_equal(theta, last_theta(whole))
+    assert loaded.config.name == "whole" and loaded.config.balls == "player3/M0"
     again = Toy()
-    tune(tmp_path / "first", tmp_path / "second", again, updates=1)
+    tune(whole, tmp_path / "second", again, updates=1)
     np.testing.assert_array_equal(again.played[0][0], theta)
 
 
@@ -330,34 +330,34 @@ def test_no_more_than_the_episode_in_play_is_lost(source, whole, tmp_path, after
     assert len(metrics.read(tmp_path / "cut" / "metrics.jsonl")) == 3
 
 
-def test_it_continues_from_the_journal_when_checkpoints_are_gone(source, tmp_path):
-    tune(source, tmp_path / "run", Toy())
-    theta = last_theta(tmp_path / "run")
-    for path in (tmp_path / "run" / "checkpoints").iterdir():
-        path.unlink()
+def test_it_continues_from_the_journal_when_checkpoints_are_gone(source, whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "whole")
+    shutil.rmtree(run / "checkpoints")
     rest = Toy()
-    tune(source, tmp_path / "run", rest)
+    tune(source, run, rest)
     assert not rest.played
-    np.testing.assert_array_equal(last_theta(tmp_path / "run"), theta)
+    np.testing.assert_array_equal(last_theta(run), last_theta(whole))
 
 
-def test_half_a_line_is_dropped_and_its_episode_played_again(source, whole, tmp_path):
+@pytest.fixture
+def journal(source, tmp_path) -> Path:
+    """The journal of a run that lost power in its ninth episode."""
     with pytest.raises(Interrupted):
         tune(source, tmp_path / "run", Failing(8))
-    path = tmp_path / "run" / loop.JOURNAL
-    content = path.read_bytes()
+    return tmp_path / "run" / loop.JOURNAL
+
+
+def test_half_a_line_is_dropped_and_its_episode_played_again(source, whole, journal):
+    content = journal.read_bytes()
     for cut in (1, 50, len(content.splitlines()[-1])):
-        path.write_bytes(content[:-cut])
-        assert len(entries(tmp_path / "run")) == 7
-    tune(source, tmp_path / "run", Toy())
-    assert path.read_bytes() == (whole / loop.JOURNAL).read_bytes()
+        journal.write_bytes(content[:-cut])
+        assert len(entries(journal.parent)) == 7
+    tune(source, journal.parent, Toy())
+    assert journal.read_bytes() == (whole / loop.JOURNAL).read_bytes()
 
 
-def test_a_journal_that_was_changed_is_refused(source, tmp_path):
-    with pytest.raises(Interrupted):
-        tune(source, tmp_path / "run", Failing(8))
-    path = tmp_path / "run" / loop.JOURNAL
-    lines = path.read_bytes().splitlines(keepends=True)
+def test_a_journal_that_was_changed_is_refused(journal):
+    lines = journal.read_bytes().splitlines(keepends=True)
     assert b'"discarded": false' in lines[2]
     changes = {
         "nonsense": [*lines[:2], b"nonsense\n", *lines[3:]],
@@ -368,30 +368,26 @@ def test_a_journal_that_was_changed_is_refused(source, tmp_path):
         "the last one changed": [*lines[:-1], lines[-1].replace(b'"discarded": false', b'"discarded": true')],
     }
     for change, content in changes.items():
-        path.write_bytes(b"".join(content))
+        journal.write_bytes(b"".join(content))
         with pytest.raises(RunError, match=f"line {len(lines) if 'last' in change else 3} was changed"):
-            Journal(path)
+            Journal(journal)
 
 
-def test_a_journal_from_before_there_were_checksums_goes_on(source, whole, tmp_path):
-    with pytest.raises(Interrupted):
-        tune(source, tmp_path / "run", Failing(8))
-    path = tmp_path / "run" / loop.JOURNAL
-    old = re.sub(rb', "checksum": "[0-9a-f]+"', b"", path.read_bytes())
-    path.write_bytes(old)
-    tune(source, tmp_path / "run", Toy())
-    assert len(entries(tmp_path / "run")) == len(entries(whole))
-    path.write_bytes(path.read_bytes().replace(b'"discarded": false', b'"discarded": true', 1))
+def test_a_journal_from_before_there_were_checksums_goes_on(source, whole, journal):
+    old = re.sub(rb', "checksum": "[0-9a-f]+"', b"", journal.read_bytes())
+    journal.write_bytes(old)
+    tune(source, journal.parent, Toy())
+    assert len(entries(journal.parent)) == len(entries(whole))
+    journal.write_bytes(journal.read_bytes().replace(b'"discarded": false', b'"discarded": true', 1))
     with pytest.raises(RunError, match=f"line {len(old.splitlines()) + 1} was changed, or lines before it"):
-        Journal(path)
+        Journal(journal)
 
 
-def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):
-    tune(source, tmp_path / "run", Toy(), updates=2)
+def test_another_fine_tuning_in_the_same_folder_is_refused(source, whole):
     with pytest.raises(RunError, match=r"settings\.sigma: the run has 0\.025, now 0\.05"):
-        tune(source, tmp_path / "run", Toy(), updates=2, sigma=0.05)
+        tune(source, whole, Toy(), sigma=0.05)
     with pytest.raises(RunError, match="updates = 1"):
-        tune(source, tmp_path / "run", Toy(), updates=1)
+        tune(source, whole, Toy(), updates=1)
 
 
 def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, whole, tmp_path):

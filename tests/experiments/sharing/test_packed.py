@@ -1,4 +1,7 @@
-"""Packed policies: the same run gives the same bytes, every other byte is refused, and a folder is whole or absent."""
+"""Packed policies: the same run gives the same bytes, every other byte is refused, and a folder is whole or absent.
+
+Their card says what was measured, with its interval, and of which kind of evaluation it is.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,9 @@ import yaml
 from experiments import cli
 from experiments.config.experiment import parse
 from experiments.runs.locate import SHIPPED
-from experiments.sharing import packed
+from experiments.sharing import card, packed
 from experiments.sharing.packed import MEMBERS, SUMS, PackError, pack, read, unpack, zipped
+from experiments.stats import wilson
 from robot_io.policy import artefact as artefacts
 
 
@@ -93,7 +97,7 @@ def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     with zipfile.ZipFile(file) as archive:
         for i in archive.infolist():
             outside[i.header_offset + 30 + len(i.filename) :][: i.file_size] = False
-    for byte in np.r_[np.flatnonzero(outside)[::3], random.integers(0, len(raw), 200)]:
+    for byte in np.r_[np.flatnonzero(outside)[::12], random.integers(0, len(raw), 60)]:
         content = bytearray(raw)
         content[byte] ^= 1 << int(random.integers(0, 8))
         damaged.write_bytes(content)
@@ -189,3 +193,39 @@ def test_commands(run, tmp_path, capsys, monkeypatch):
     assert "allowed: .zip" in capsys.readouterr().err
     assert cli.main(["unpack", "none.zip"]) == 1
     assert cli.main(["pack", "none"]) == 1
+
+
+@pytest.fixture(scope="module")
+def artefact():
+    return artefacts.load(SHIPPED / "quickstart")
+
+
+def write(artefact, evaluation) -> str:
+    return card.write(artefact, artefact.manifest["provenance"]["config"], evaluation)
+
+
+def row(text: str, name: str) -> list[str]:
+    (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
+    return [cell.strip() for cell in line.strip("|").split("|")][1:]
+
+
+def test_figures_come_with_their_intervals_and_conditions(artefact):
+    evaluation = artefact.manifest["provenance"]["evaluation"]
+    text = write(artefact, evaluation)
+    n, counts = evaluation["episodes"], evaluation["outcomes"]
+    for name, k in (("returned", counts["returned"]), ("hit", counts["returned"] + counts["hit"])):
+        low, high = wilson(k, n)
+        expected = [f"{100 * k / n:.1f} %", f"{100 * low:.1f} % to {100 * high:.1f} %", f"{n:,} balls"]
+        assert row(text, name) == expected
+    assert row(text, "in reach, at least")[2] == "256 of them"
+    for words in ("balls of player3/M0", "seed 1000", "engine fused, 300 Hz", "nominal model", "without randomisation"):
+        assert words in " ".join(text.split())
+    assert artefact.digest in text and "not stated" in text and "license:" not in text
+
+
+def test_an_evaluation_after_fine_tuning_names_the_robot(artefact):
+    after = {"return_rate": 0.5, "return_rate_low": 0.4, "return_rate_high": 0.6, "balls": 80, "mean_return": 1.0}
+    text = write(artefact, {"after": after, "updates": 12, "robot": {"robot": "the rig", "balls": 3}})
+    assert row(text, "returned") == ["50.0 %", "40.0 % to 60.0 %", "80 balls"]
+    assert "fine-tuned for 12 updates on the rig" in text and "Played there" in text
+    assert "on no robot" not in text and "2,600 updates" not in text

@@ -163,6 +163,7 @@ def test_a_swapped_policy_is_found(tmp_path, artefacts):
         ("A,1,5,99", "no end of a rally; 1 to"),
         ("A,1,five,13", "invalid literal"),
         ("A,1,5,13\nA,1,6,13", "rally 1 of A is there twice"),
+        ("A,1,0,14\nA,2,0,13", "length 0: the human's first hit is 1"),  # the first is a dummy ball, not counted
     ],
 )
 def test_a_bad_line_of_a_sheet_is_named(tmp_path, line, says):
@@ -171,10 +172,11 @@ def test_a_bad_line_of_a_sheet_is_named(tmp_path, line, says):
         blind_protocol.read_sheet(tmp_path / "sheet.csv")
 
 
-def test_a_folder_without_a_policy_is_refused(tmp_path):
+def test_a_folder_without_a_policy_and_an_evaluation_without_a_trainer_are_refused(tmp_path, artefacts, capsys):
     with pytest.raises(ConfigError, match="mjx-tt export"):
         blind_protocol.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
-    assert not (tmp_path / "b").exists()
+    assert cli.main(["blind", "make", str(tmp_path / "b"), *(f"{model}={artefacts / model}" for model in MODELS)]) == 1
+    assert "--trainer" in capsys.readouterr().err and not (tmp_path / "b").exists()
 
 
 def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
@@ -194,12 +196,6 @@ def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
     assert times == sorted(times)
 
 
-def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
-    given = [f"{model}={artefacts / model}" for model in MODELS]
-    assert cli.main(["blind", "make", str(tmp_path / "b"), *given]) == 1
-    assert "--trainer" in capsys.readouterr().err and not (tmp_path / "b").exists()
-
-
 @pytest.mark.parametrize("separator, encoding", [(";", "utf-8-sig"), ("\t", "utf-8"), (",", "utf-8")])
 def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
     path = tmp_path / "sheet.csv"
@@ -209,15 +205,6 @@ def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
     lines = [f'"{line}"{separator * 3}' if line.startswith("#") else line for line in lines] + [separator * 3]
     path.write_bytes("\r\n".join(lines).encode(encoding))
     assert blind_protocol.read_sheet(path) == {"A": [blind_protocol.Played(2, 5, scoring.End.ROBOT_MISSED)], "B": []}
-
-
-def test_a_rally_that_counts_has_a_touch(tmp_path):
-    path = tmp_path / "sheet.csv"
-    path.write_text("code,rally,length,end\nA,1,0,14\nA,2,0,1\n")  # a dummy ball by hand; not counted
-    assert [p.length for p in blind_protocol.read_sheet(path)["A"]] == [0, 0]
-    path.write_text("code,rally,length,end\nA,1,0,13\n")
-    with pytest.raises(ConfigError, match="line 2: length 0: the human's first hit is 1"):
-        blind_protocol.read_sheet(path)
 
 
 def test_the_page_to_print_has_instructions_ends_and_a_sheet_for_each_code(tmp_path):

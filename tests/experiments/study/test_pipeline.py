@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from ballmodel.aerodynamics import drag_factor, magnus_factor
 from ballmodel.state import BallState
 from bgs import normalizer, strategy
-from experiments.config import build, experiment
+from experiments.config import build, experiment, files
 from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.jobs.site import ALONE
@@ -103,7 +103,7 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full", "study_paper"])
 def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for_one(name):
-    shipped = study_config.load(study_config.shipped()[name])
+    shipped = study_config.load(files.find_shipped(name, "study"))
     assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
     assert len(shipped.players) == 5
     tuning = shipped.fine_tuning
@@ -111,7 +111,7 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
     # Where the paper's are not needed perturbations are nearer; the step per perturbation is the same.
     assert tuning.step.learning_rate / tuning.sigma == pytest.approx(0.15) == 0.00375 / 0.025
     assert tuning.sigma == (0.025 if name in ("study_full", "study_paper") else 0.01)
-    assert name not in experiment.shipped() and "quickstart" in experiment.shipped()
+    assert name not in files.shipped("train") and "quickstart" in files.shipped("train")
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
 
 
 def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
-    whole = study_config.load(study_config.shipped()["study_full"], ("identification={}",))
+    whole = study_config.load(files.find_shipped("study_full", "study"), ("identification={}",))
     needs = {
         Human: lambda i: i.data,
         Identified: lambda i: i.data,
@@ -208,7 +208,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
 
 
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
-    whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
+    whole = study_config.load(files.find_shipped("study_full", "study"), ("fresh=false", "ablation=null"))
     pairs = schedule.list_pairings(whole)
     for player in whole.players:
         assert sum(t == e == player for t, e, _ in pairs) == 10
@@ -217,7 +217,7 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
 
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
-    night = study_config.load(study_config.shipped()["study_night"])
+    night = study_config.load(files.find_shipped("study_night", "study"))
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if isinstance(item, Simulated)}
     first = make_config(night, by_key["is2r-sim1"], "player3/M0", None, 5)
     later = make_config(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
@@ -232,8 +232,8 @@ def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
 
 def test_the_papers_study_trains_as_the_papers_training():
     """With the settings of the shipped paper.yaml, which the tests of training hold against the paper."""
-    study_ = study_config.load(study_config.shipped()["study_paper"])
-    paper = experiment.load(experiment.shipped()["paper"])
+    study_ = study_config.load(files.find_shipped("study_paper", "study"))
+    paper = experiment.load(files.find_shipped("paper", "train"))
     assert study_.simulation.optimiser == paper.optimiser
     assert study_.simulation.task == paper.task and study_.simulation.model == paper.model
     step = paper.optimiser.step
@@ -263,8 +263,6 @@ def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
     assert hidden_effects.draw(3, get_args(study_config.Effect)) == models.with_values(SimModel(), {})
     other = hidden_effects.list_differences(hidden_effects.draw(4))
     assert all(other[path] != value for path, value in everything.items())
-    with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
-        hidden_effects.draw(3, ("magic",))
 
 
 def test_ranges_of_realities_hold_what_training_believes_and_lie_within_the_prior():
@@ -291,8 +289,12 @@ def test_effects_from_outside_come_on_top_and_change_no_other():
         assert hidden_effects.describe(model, 3, (), (effect,))["outside"] == [effect]
     assert "outside" not in hidden_effects.describe(hidden_effects.draw(3), 3, ())
     assert tuple(hidden_effects.OUTSIDE) == get_args(study_config.Outside)
-    with pytest.raises(ValueError, match="outside of the model is called 'magic'; there are lift, bounce"):
-        hidden_effects.draw(3, outside=("magic",))
+    for said, given in (
+        ("no effect is called 'magic'; there are rubber", {"without": ("magic",)}),
+        ("outside of the model is called 'magic'; there are lift, bounce", {"outside": ("magic",)}),
+    ):
+        with pytest.raises(ValueError, match=said):
+            hidden_effects.draw(3, **given)
 
 
 def test_measured_balls_are_the_flight_as_the_camera_sees_it():

@@ -1,4 +1,4 @@
-"""The study's statistics against other libraries and hand-computed numbers; its report on made-up studies."""
+"""The study's scoring and statistics against other libraries and numbers by hand; its report on made-up studies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, Me
 from experiments.study.analysis.statistics import Bootstrap, Interval
 from experiments.study.analysis.study_folder import StudyFolder
 from experiments.study.report import figures
-from mjx_tt.rally.end_reasons import End
+from mjx_tt.rally.end_reasons import ROWS, End
 from tests.support import made_up_study
 
 
@@ -263,9 +263,13 @@ def whole(tmp_path_factory):
     return folder
 
 
-def test_measured_means_are_the_known_ones(whole):
-    study = study_data.load(whole)
-    m, counted = Measurements(study), Bootstrap(study.pick(own=None, selected=False))
+@pytest.fixture(scope="module")
+def measurements(whole):
+    return Measurements(study_data.load(whole))
+
+
+def test_measured_means_are_the_known_ones(measurements):
+    m, counted = measurements, Bootstrap(measurements.study.pick(own=None, selected=False))
     for model in study_paper.TEN:
         for player in ("player3", "player1"):
             known, found = made_up_study.mean_length(player, model), counted.mean(model, [player])
@@ -277,8 +281,8 @@ def test_measured_means_are_the_known_ones(whole):
     assert m.robot_ended_share().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
 
 
-def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
-    found = Measurements(study_data.load(whole)).findings
+def test_claims_are_judged_as_the_made_up_numbers_demand(measurements):
+    found = measurements.findings
     assert set(found) == {claim.key for claim in study_paper.CLAIMS}
     for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
         assert found[key].verdict.startswith("agrees"), (key, found[key])
@@ -309,7 +313,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
     assert paper[0] == ["player3 (beginner)", "paper", "2", "3", "7", "5.9", "9", "52", "500"]
 
 
-def test_identified_worlds_stand_beside_the_opened_reality(whole):
+def test_identified_worlds_stand_beside_the_opened_reality(whole, measurements):
     with open(whole / "report" / "identified.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     held = {(row["parameter"], row["truth"], row["holds it"]) for row in rows}
@@ -319,8 +323,7 @@ def test_identified_worlds_stand_beside_the_opened_reality(whole):
     assert counted["different intervals of 90 % that hold the truth"] == "2 of 4"  # of two seeds, both players alike
     assert counted["decided by"] == "prior"
     assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
-    m = Measurements(study_data.load(whole))
-    ratio, known = m.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
+    ratio, known = measurements.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
     assert ratio.low < known < ratio.high
 
 
@@ -395,3 +398,99 @@ def test_a_damaged_file_is_named(tmp_path, name):
         with pytest.raises(ConfigError) as said:
             read(folder)
         assert str(said.value).startswith(str(folder / name)), (content, str(said.value))
+
+
+# Table end_of_rally_attribution, row by row as printed: did-robot-end-rally ("" where empty or a dash) and "Filter".
+PRINTED = [
+    ("", "Filter"),
+    ("", "Filter"),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("Yes", ""),
+    ("No", ""),
+    ("No", ""),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("", "Filter"),
+    ("No", ""),
+    ("No", ""),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("", "Filter"),
+]
+
+
+def test_ends_are_attributed_as_in_the_papers_table():
+    one = scoring.score_rallies(0, "p", "p", "m", "A", np.ones(15, int), [row[0] for row in ROWS[:15]])
+    printed = {"Yes": 1, "No": 0, "": scoring.UNKNOWN}
+    assert one.robot_ended.tolist() == [printed[who] for who, _ in PRINTED]
+    assert one.filtered.tolist() == [what == "Filter" for _, what in PRINTED]
+
+
+def test_a_return_beside_the_table_is_the_robots():
+    one = scoring.score_rallies(0, "p", "p", "m", "A", [4], [End.ROBOT_OUT])
+    assert one.robot_ended.tolist() == [1] and not one.filtered[0] and one.selected[0]
+
+
+def test_selection_is_the_longest_five_sixths_of_the_first_sixty():
+    rng = np.random.default_rng(1)
+    for count in (10, 55, 64, 90):
+        length, filtered = rng.integers(1, 30, count), rng.random(count) < 0.15
+        chosen = scoring.choose_reported(length, filtered)
+        pool = [i for i in range(count) if not filtered[i]][:60]
+        wanted = {60: 50}.get(len(pool), round(len(pool) * 5 / 6))
+        while len(pool) > wanted:  # take away the shortest, one by one; of equal ones the last played
+            pool.remove(min(pool, key=lambda i: (length[i], -i)))
+        assert np.flatnonzero(chosen).tolist() == pool
+
+
+def test_fewer_rallies_that_count_do_not_shift_the_mean():
+    """The same lengths, of 60 rallies 8 filtered or none: the means agree, as 50 of 52 and 50 of 60 would not."""
+    rng, means = np.random.default_rng(4), []
+    for dropped in (8, 0):
+        end = np.where(np.arange(60) < dropped, End.SERVICE, End.ROBOT_MISSED)
+        drawn = (scoring.score_rallies(0, "p", "p", "m", "A", rng.geometric(0.05, 60), end) for _ in range(2000))
+        means.append([one.length[one.selected].mean() for one in drawn])
+    few, many = np.mean(means, axis=1)
+    assert few == pytest.approx(many, rel=0.02)  # each is known to 0.4 %
+    assert many == pytest.approx(1.18 * 20.0, rel=0.02)
+    assert [scoring.count_reported(n) for n in (0, 1, 52, 60)] == [0, 1, 43, 50]
+
+
+def test_a_rally_after_the_sixtieth_is_not_reported_however_long():
+    length = np.full(61, 3)
+    length[60] = 300
+    assert not scoring.choose_reported(length, np.zeros(61, bool))[60]
+    filtered = np.zeros(61, bool)
+    filtered[7] = True  # now it is the sixtieth that counts
+    assert scoring.choose_reported(length, filtered)[60]
+
+
+def test_the_file_keeps_every_rally(tmp_path):
+    rng = np.random.default_rng(2)
+    ends = rng.integers(0, len(End), 70)
+    evaluations = ((0, "player1", "player1"), (0, "player1", "player4"), (3, "player2", "player2"))
+    written = scoring.join(
+        scoring.score_rallies(seed, trainer, evaluator, "is2r-ft100", "Q", rng.integers(1, 40, 70), ends)
+        for seed, trainer, evaluator in evaluations
+    )
+    scoring.write(tmp_path / "evaluations.csv", written)
+    read = scoring.read(tmp_path / "evaluations.csv")
+    for name in scoring.COLUMNS:
+        assert getattr(read, name).tolist() == getattr(written, name).tolist(), name
+    assert read.own.sum() == 140
+    lines = (tmp_path / "evaluations.csv").read_text().splitlines()
+    assert lines[0] == "seed,trainer,evaluator,model,blind,rally,length,end,robot_ended,filtered,selected"
+    assert len(lines) == 211
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["0,a,a,m,A,0,5,fell_asleep", "0,a,a,m,A,0,5,3", "0,a,a,m,A,0,long,robot_missed", "x,a,a,m,A,0,5,robot_missed"],
+)
+def test_a_bad_line_is_named(tmp_path, line):
+    """An end by its number, too: it could be counted from 0 or from 1."""
+    path = tmp_path / "evaluations.csv"
+    path.write_text(",".join(scoring.COLUMNS[:8]) + "\n" + line + "\n")
+    with pytest.raises(ConfigError, match="evaluations.csv: line 2: .* wanted are seed, trainer"):
+        scoring.read(path)

@@ -17,7 +17,7 @@ from bgs.strategy import BGSConfig
 from experiments.config import build
 from experiments.config.experiment import load
 from experiments.training.first_order import FirstOrderTrainer
-from experiments.training.trainers import trainer as trainer_of
+from experiments.training.loop import make_trainer
 from mjx_tt.env.episode import MISSED
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
@@ -39,31 +39,27 @@ def trainer_on(devices, pool, config=BGS, repeats=REPEATS):
     return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), episodes_per_direction=repeats)
 
 
-@pytest.fixture(scope="module")
-def trainers(pool):
-    """By number of devices."""
-    return {devices: trainer_on(devices, pool) for devices in (1, 2)}
+def updated(devices, pool):
+    """A trainer, the states before and after one update, and its metrics."""
+    trainer = trainer_on(devices, pool)
+    before = trainer.init(jax.random.key(1))
+    after, metrics = trainer.update(before)
+    return trainer, before, after, jax.tree.map(float, metrics)
 
 
 @pytest.fixture(scope="module")
-def updated(trainers):
-    """By number of devices, the state before and after one update, and its metrics."""
-    found = {}
-    for devices, trainer in trainers.items():
-        before = trainer.init(jax.random.key(1))
-        after, metrics = trainer.update(before)
-        found[devices] = before, after, jax.tree.map(float, metrics)
-    return found
+def one(pool):
+    return updated(1, pool)
 
 
-def test_two_devices_learn_what_one_learns(updated):
-    (_, one, metrics), (_, two, metrics_of_two) = updated[1], updated[2]
-    np.testing.assert_allclose(two.bgs.theta, one.bgs.theta, rtol=1e-4, atol=1e-6)
-    assert metrics_of_two == pytest.approx(metrics, rel=1e-3, abs=1e-6)
+def test_two_devices_learn_what_one_learns(one, pool):
+    _, _, after, metrics = updated(2, pool)
+    np.testing.assert_allclose(after.bgs.theta, one[2].bgs.theta, rtol=1e-4, atol=1e-6)
+    assert metrics == pytest.approx(one[3], rel=1e-3, abs=1e-6)
 
 
-def test_an_update_climbs_the_clipped_gradient_and_averages(updated):
-    before, after, metrics = updated[1]
+def test_an_update_climbs_the_clipped_gradient_and_averages(one):
+    _, before, after, metrics = one
     change = np.asarray(after.bgs.theta - before.bgs.theta)
     # Plain steps of rate 0.01 along a gradient whose norm is cut to 1.
     assert np.linalg.norm(change) == pytest.approx(0.01 * min(1.0, metrics["gradient_norm"]), rel=1e-3)
@@ -79,8 +75,8 @@ def poisoned(trainer, pool, balls):
     return trainer.simulator.replicate(pool), trainer.inputs[1]
 
 
-def test_policies_that_meet_a_ball_without_a_finite_cost_are_counted_and_do_not_learn(updated, trainers, pool):
-    trainer, (before, whole, _) = trainers[1], updated[1]
+def test_policies_that_meet_a_ball_without_a_finite_cost_are_counted_and_do_not_learn(one, pool):
+    trainer, before, whole, _ = one
     _, episodes = trainer._draw(before, trainer.inputs, 2 * PAIRS)
     thrown, x = np.asarray(episodes.ball.position[0]), np.asarray(pool.state.position[0])
     ball = next(i for i in range(len(x)) if (thrown == x[i]).any())
@@ -92,8 +88,8 @@ def test_policies_that_meet_a_ball_without_a_finite_cost_are_counted_and_do_not_
     assert np.abs(np.asarray(after.bgs.theta - whole.bgs.theta)).max() > 0.0
 
 
-def test_without_one_finite_episode_nothing_changes(updated, trainers, pool):
-    trainer, (_, before, _) = trainers[1], updated[1]
+def test_without_one_finite_episode_nothing_changes(one, pool):
+    trainer, _, before, _ = one
     after, metrics = trainer._update(before, poisoned(trainer, pool, np.arange(64)))
     np.testing.assert_array_equal(after.bgs.theta, before.bgs.theta)
     np.testing.assert_array_equal(after.bgs.average, before.bgs.average)
@@ -117,7 +113,7 @@ def test_other_networks_and_robots_learn_as_well(kind, tmp_path):
         "optimiser: {gradient: first_order, num_directions: 1, repeats: 8, sigma: 1.0e-6, ema_decay: 0.0, "
         "step: {kind: sgd, learning_rate: 0.003, schedule: {kind: constant}}}\ntraining: {pool: 32, devices: 1}\n"
     )
-    trainer = trainer_of(build.experiment(load(file), str(file)))
+    trainer = make_trainer(build.experiment(load(file), str(file)))
     before = trainer.init(jax.random.key(1))
     after, metrics = trainer.update(before)
     # The same update again, with the same balls, from the later parameters.

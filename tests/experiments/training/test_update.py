@@ -16,7 +16,6 @@ from bgs import normalizer, optimizers, strategy
 from bgs.strategy import BGSConfig
 from experiments.config import build, experiment, files
 from experiments.training import loop
-from experiments.training.trainers import trainer as trainer_of
 from experiments.training.update import Trainer
 from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy
@@ -90,7 +89,7 @@ def test_a_program_compiled_for_some_samples_serves_others(pool):
 
 def test_samples_of_the_same_parameters_have_one_program_others_another():
     def program(model: dict) -> str:
-        config = experiment.load(experiment.shipped()["quickstart"]).model_copy(update={"model": model})
+        config = experiment.load(files.find_shipped("quickstart", "train")).model_copy(update={"model": model})
         return loop.program(config, 1)
 
     def world(restitution: float, height: float, **samples: list) -> dict:
@@ -200,7 +199,7 @@ def test_the_same_yaml_trains_under_both_engines():
     returns = {}
     for engine in ("fused", "mjx"):
         settings = experiment.parse(files.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
-        trainer = trainer_of(build.experiment(settings, "tiny.yaml"))
+        trainer = loop.make_trainer(build.experiment(settings, "tiny.yaml"))
         state, metrics = trainer.update(trainer.init(build.key(0, build.INITIAL_STATE)))
         assert trainer.simulator.task.engine.name == engine
         assert int(state.bgs.updates) == 1 and np.isfinite(state.bgs.theta).all()

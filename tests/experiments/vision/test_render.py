@@ -1,10 +1,19 @@
-"""Frames against closed forms: where the streak is, how long, how much noise; and what is still stays as it was."""
+"""Frames against closed forms: where the streak is, how long, how much noise; a ball is tracked in them."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
 
 from experiments.vision import render
+from experiments.vision.pipeline import SHIPPED
+from experiments.vision.rendered_rig import RenderedCameras
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.tracker import TrackerEmulator, TrackerParams
+from robot_io.vision import rig
 from robot_io.vision.camera import look_at
+from tests.support.lockstep_play import throws
+from tests.support.lockstep_play import world as shared_world
 
 CAMERA = look_at("side", (-2.3, -0.9, 1.8))
 START, VELOCITY = np.array([0.1, -0.2, 0.3]), np.array([1.0, 6.0, 0.5])
@@ -76,3 +85,27 @@ def test_the_mosaic_keeps_the_colour_of_each_pixel():
     pattern = [[0, 1], [1, 2]]  # red green, green blue
     expected = [[image[y, x, pattern[y % 2][x % 2]] for x in range(6)] for y in range(4)]
     np.testing.assert_array_equal(render.mosaic(image), expected)
+
+
+def test_rendered_cameras_are_for_lock_step():
+    with pytest.raises(ValueError, match="'rendered'; it is for lock-step"):
+        TrackerEmulator(TrackerParams(cameras="rendered"), 0)
+
+
+@pytest.mark.slow
+def test_a_thrown_ball_is_tracked_in_its_pictures():
+    params = RigParams(tracker=TrackerParams(cameras="rendered"))
+    world = shared_world()
+    world.reset()
+    tracker = RenderedCameras(rig.standard(), SHIPPED).open(params.tracker, world, 1)
+    balls, errors = throws(), []
+    world.throw(balls.position[:, 0], balls.velocity[:, 0], balls.spin[:, 0])
+    for _ in range(40):
+        world.advance(np.zeros(8), 0.008)
+        if not world.in_play:
+            break
+        tracker.step(world.time, 1, world.ball)
+        ball = tracker.tracker.reported
+        errors.append(np.inf if ball is None else float(np.linalg.norm(ball.ball.mean[:3] - world.ball)))
+    assert np.median(errors) < 0.005
+    assert len(tracker.due(world.time + 1.0)) == len(errors)

@@ -27,6 +27,7 @@ from experiments.study import identification
 from experiments.study.analysis import scoring
 from experiments.study.analysis.identified import LOGS, list_estimates
 from experiments.study.target_domain import play_on_robot
+from experiments.study.target_domain.lab_logs import AWAY, count_visible
 from experiments.study.target_domain.play_on_robot import make_rally_step
 from experiments.study.workflow import derive_seed
 from experiments.training import sweep
@@ -230,3 +231,27 @@ def test_the_seed_that_plays_best_on_the_emulated_robot_is_chosen(tmp_path, monk
     sweep.select(tmp_path, jobs, Console(file=io.StringIO()), "lockstep", score)
     selection = json.loads((tmp_path / "selection.json").read_text())
     assert selection["robot"] == "lockstep" and selection["scores"] == {"seed0": worth[0]}
+
+
+RATE = 125.0  # [Hz]
+
+
+def thrown(height: float, up: float, seconds: float = 1.4) -> np.ndarray:
+    """A parabola from behind the player's end of the table, (3, T) [m]."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    return np.stack([0.0 * t, 1.7 - 3.0 * t, height + up * t - 4.905 * t**2])
+
+
+@pytest.mark.parametrize(("height", "up"), [(0.3, 1.0), (-0.07, 2.5), (-0.4, 3.5)])
+def test_a_ball_is_seen_until_it_falls_below_the_table_however_low_it_was_struck(height, up):
+    low = -0.03  # under the table's plane
+    falls_below = (up + (up**2 + 4.0 * 4.905 * (height - low)) ** 0.5) / 9.81  # [s]
+    assert count_visible(thrown(height, up)) / RATE == pytest.approx(falls_below, abs=1.01 / RATE)
+
+
+def test_a_ball_is_seen_until_it_passes_the_robot_or_comes_back_past_the_player():
+    passing = thrown(0.3, 7.0)
+    assert count_visible(passing) / RATE == pytest.approx(4.0 / 3.0, abs=1.01 / RATE)
+    back, t = passing.copy(), np.arange(passing.shape[1]) / RATE
+    back[1] = np.where(t < 0.3, 1.7 - 3.0 * t, 0.8 + 3.0 * (t - 0.3))  # where it was struck again after 0.6 s
+    assert count_visible(back) / RATE == pytest.approx(0.6 + AWAY / 3.0, abs=1.01 / RATE)
