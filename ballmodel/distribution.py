@@ -9,6 +9,7 @@ person played. The mixture keeps them.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -65,7 +66,7 @@ class BallDistribution:
         }
         return {"name": self.name, "source": self.source, **intervals, **_short(self.short_balls)}
 
-    def _ends(self, part: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _ends(self, part: str) -> tuple[Sequence[float], Sequence[float]]:
         return getattr(self, f"{part}_min"), getattr(self, f"{part}_max")
 
 

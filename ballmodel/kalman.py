@@ -99,7 +99,7 @@ def _move(
     return states, bounced
 
 
-def _step(states: States, dt: np.ndarray, physics: Physics) -> States:
+def _step(states: States, dt: np.ndarray | float, physics: Physics) -> States:
     velocity, spin = states[3:6], states[6:]
     middle = velocity + 0.5 * dt * accelerate(velocity, spin, physics)
     after = np.empty(np.broadcast_shapes(states.shape, np.shape(dt)))

@@ -17,7 +17,7 @@ from rich.console import Console
 from ballmodel.distribution import save_distribution
 from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
-from experiments.config import build, experiment
+from experiments.config import build, experiment, files
 from experiments.runs import load_policy
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
@@ -52,7 +52,7 @@ class Learner:
 
     def __init__(self, updates: int, seed: int = 0) -> None:
         self._config = experiment.load(
-            experiment.shipped()[RECIPE],
+            files.shipped("train")[RECIPE],
             (f"training.updates={updates}", "training.evaluate_every=null", "training.devices=1"),
         )
         self._seed = seed

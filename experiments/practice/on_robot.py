@@ -188,8 +188,8 @@ class GrowingLog:
     def read(self) -> tuple[tuple[Trajectory, ...], list[bool], tuple[JointRecord, ...]]:
         """Balls that ended since the last look, outcomes known since, and the joints of the last two files."""
         from experiments.deploy import session_logs
-        from robot_io.errors import LogError
         from robot_io.log import reader, writer
+        from robot_io.log.messages import LogError
 
         files = [path for path in writer.parts(self._first) if path.exists()]
         unfinished = writer.part_of(self._first, len(files) + 1).with_suffix(writer.UNFINISHED)

@@ -140,7 +140,7 @@ def _unsupported_actuators(model: mujoco.MjModel) -> Iterator[str]:
             yield f"{name}: joint {joint_name} already has actuator {object_name(model, _OBJ.mjOBJ_ACTUATOR, first)}"
 
 
-def _any(model: mujoco.MjModel, field: str, index: int) -> bool:
+def _any(model: mujoco.MjModel, field: str, index: int | np.integer) -> bool:
     """True where the field has a non-zero entry at index; False where this MuJoCo release does not have the field."""
     values = getattr(model, field, None)
     return values is not None and bool(np.any(values[index]))

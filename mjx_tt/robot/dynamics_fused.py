@@ -12,6 +12,8 @@ result equals MuJoCo C's to rounding.
 from __future__ import annotations
 
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import Chain, Link
@@ -29,7 +31,7 @@ class FusedEngine:
         gravcomp = {link.gravcomp for link in chain.links if link.mass > 0.0}
         self._uniform_gravcomp = gravcomp.pop() if len(gravcomp) == 1 else None
 
-    def step(self, qpos: Joints, qvel: Joints, ctrl: Joints) -> tuple[Joints, Joints]:
+    def step(self, qpos: Joints, qvel: Joints, ctrl: Float[Array, "actuators *batch"]) -> tuple[Joints, Joints]:
         """One step. qpos [m]/[rad], qvel [m/s]/[rad/s], ctrl in the actuators' units: each (n, ...)."""
         h = self.timestep
         acceleration = _articulated_body(self._chain, h, self._uniform_gravcomp, qpos, qvel, ctrl)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ballmodel.contact import TABLE
 from mjx_tt.robot.chain import WORLD, chain_from_model
@@ -63,6 +63,6 @@ def describe(file: RobotFile, model: mujoco.MjModel) -> dict[str, Any]:
     }
 
 
-def _numbers(values: ArrayLike) -> list:
+def _numbers(values: Sequence | np.ndarray) -> list:
     """Nested lists, without rounding errors of rotations around 0."""
     return (np.round(np.asarray(values, float), 12) + 0.0).tolist()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float, Int, UInt32
 
@@ -20,7 +21,9 @@ def _hash(x: Array) -> Array:
     return x ^ (x >> 16)
 
 
-def symmetric_uniform(seed: UInt32[Array, "*batch"], counter: Int[Array, ""] | int, n: int) -> Float[Array, "n *batch"]:
+def symmetric_uniform(
+    seed: UInt32[Array | np.ndarray, "*batch"], counter: Int[Array, ""] | int, n: int
+) -> Float[Array, "n *batch"]:
     """Uniform numbers in (-1, 1), shape (n, ...), from per-episode seeds (...) uint32 and a step counter."""
     base = _hash(seed ^ (jnp.asarray(counter, jnp.uint32) * jnp.uint32(0x9E3779B9)))
     bits = [_hash(base + jnp.uint32((i + 1) * 0x85EBCA6B & 0xFFFFFFFF)) for i in range(n)]

@@ -24,7 +24,7 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.diagnosis.hits.diagnose import FARTHEST, compare_returns, spread, watched_hits
-from mjx_tt.diagnosis.hits.paddle_path import joint_path, poses
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path, poses
 from mjx_tt.diagnosis.joint.fit import slopes
 from mjx_tt.diagnosis.joint.forward_model import nominal_response
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointLog, JointRecord
@@ -70,14 +70,12 @@ class Scorer:
         second = first + len(HIT_EFFECTS) + len(RETURN)
         incoming = [(i, flown[0]) for i, t in enumerate(balls) if (flown := flights([t])) and _approaches(flown[0])]
         if incoming:
-            rows, flown = zip(*incoming, strict=True)
-            found[list(rows), :first] = self._of_flights(flown)
+            found[[i for i, _ in incoming], :first] = self._of_flights([flight for _, flight in incoming])
         path = joint_path(joints, self._model) if joints else None
         place = {id(t): i for i, t in enumerate(balls)}
         hits = [(place[id(t)], pair) for t in balls for pair in watched_hits([t], path)]
         if hits:
-            rows, pairs = zip(*hits, strict=True)
-            found[list(rows), first:second] = self._of_hits(pairs, path)
+            found[[i for i, _ in hits], first:second] = self._of_hits([pair for _, pair in hits], path)
         for i, ball in enumerate(balls if joints else ()):
             found[i, second:] = self._of_joints(joints, ball.time[0] - BESIDE, ball.time[-1] + BESIDE)
         return found
@@ -105,7 +103,7 @@ class Scorer:
         misfit = np.log(np.sqrt((linear.residual**2).sum(axis=(0, 1)) / g.mask.sum(axis=0)))
         return np.concatenate([_standardise(score, information), misfit[:, None]], axis=1)
 
-    def _of_hits(self, pairs: Sequence[tuple[Trajectory, int]], path: object) -> Float[np.ndarray, "n H"]:
+    def _of_hits(self, pairs: Sequence[tuple[Trajectory, int]], path: JointPath | None) -> Float[np.ndarray, "n H"]:
         whole, before = [t for t, _ in pairs], np.array([n for _, n in pairs])
         g = self._grid("hits", whole)
         g = replace(g, paddle=poses(whole, g.steps, path))

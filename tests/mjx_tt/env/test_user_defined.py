@@ -101,7 +101,7 @@ def a_network(shape: tuple[int, int], step: str) -> str:
         ("", "defines nothing"),
         (reward(name="'style'"), "'style': the name is one of the package's own"),
         (reward(name="'a b'"), "must be letters, digits"),
-        (reward(name="'x', per='day'"), "per is 'day', allowed: step, ball"),
+        (reward(name="'x', per='day'"), "(per is 'day', allowed: step, ball|TypeCheckError)"),
         (reward(name="'x', reduce='max'"), "'max', allowed: mean, one_minus"),
         (reward() + reward().replace("def f", "def g"), "'x': defined twice"),
         (reward("return step.comand"), "line 5: AttributeError: .*comand"),
