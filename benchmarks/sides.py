@@ -198,7 +198,7 @@ def about_jax() -> dict:
 
 def commands(shape: tuple[int, ...], axis: int) -> np.ndarray:
     """Random joint velocities [m/s], [rad/s], float32, of this shape; ``axis`` counts the joints."""
-    from robot_io.contract import LIMITS
+    from robot_io.limits import LIMITS
 
     largest = COMMAND * np.asarray(LIMITS.velocity, np.float32).reshape((-1,) + (1,) * (len(shape) - axis - 1))
     return np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32) * largest

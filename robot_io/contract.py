@@ -21,19 +21,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robot_io.errors import ContractError
+from robot_io.limits import LIMITS, JointLimits
 
 CONTRACT_VERSION = 1
 
 CONTROL_RATE = 75.0  # [Hz], Abeyruwan et al. 2022, section 4
 HISTORY = 8  # observations in the policy input, the paper's "past seven" and the current one
 
-JOINT_NAMES = ("gantry_x", "gantry_y", "joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
+JOINT_NAMES = LIMITS.joints
 JOINT_UNITS = ("m", "m", "rad", "rad", "rad", "rad", "rad", "rad")
 FESTO_JOINTS = (0, 1)  # indices into JOINT_NAMES moved by the two linear axes
 ABB_JOINTS = (2, 3, 4, 5, 6, 7)  # indices moved by the arm's controller
@@ -43,71 +44,6 @@ OBSERVATION_NAMES = (*_BALL, *JOINT_NAMES)
 OBSERVATION_UNITS = ("m", "m", "m", *JOINT_UNITS)
 N_JOINTS = len(JOINT_NAMES)
 N_OBSERVATION = len(OBSERVATION_NAMES)
-
-
-@dataclass(frozen=True)
-class JointLimits:
-    """Kinematic limits of a robot's joints, each a tuple in the order of ``joints``; SI units.
-
-    lower, upper      position range [m] / [rad]
-    velocity          highest joint speed [m/s] / [rad/s]: what the hardware does (ABB 120T manual; Festo: estimate)
-    acceleration      highest commanded acceleration [m/s^2] / [rad/s^2]
-    margin            distance kept from lower and upper by the braking envelope [m] / [rad]
-    policy_velocity   joint velocity that an action of 1 asks for; at most ``velocity``
-    joints            names of the joints
-
-    Raises ValueError naming the limit, the joint and what was given.
-    """
-
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
-    velocity: tuple[float, ...]
-    acceleration: tuple[float, ...]
-    margin: tuple[float, ...]
-    policy_velocity: tuple[float, ...]
-    joints: tuple[str, ...] = JOINT_NAMES
-
-    def __post_init__(self) -> None:
-        for name, values in self.numbers().items():
-            if len(values) != len(self.joints):
-                raise ValueError(
-                    f"JointLimits.{name} needs {len(self.joints)} numbers in the order {self.joints}, got {len(values)}"
-                )
-            if not np.all(np.isfinite(values)):
-                raise ValueError(f"JointLimits.{name} has a non-finite number: {values}")
-        for i, joint in enumerate(self.joints):
-            if not self.upper[i] - self.lower[i] > 2 * self.margin[i] >= 0:
-                raise ValueError(
-                    f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of "
-                    f"{self.margin[i]}"
-                )
-            if not 0 < self.policy_velocity[i] <= self.velocity[i]:
-                raise ValueError(
-                    f"{joint}: policy_velocity {self.policy_velocity[i]} must be in (0, {self.velocity[i]}]"
-                )
-            if not self.acceleration[i] > 0:
-                raise ValueError(f"{joint}: acceleration {self.acceleration[i]} must be positive")
-
-    def numbers(self) -> dict[str, tuple[float, ...]]:
-        """The limits by name, without the joints' names."""
-        return {name: values for name, values in asdict(self).items() if name != "joints"}
-
-
-def _rad(*degrees: float) -> tuple[float, ...]:
-    return tuple(float(np.deg2rad(d)) for d in degrees)
-
-
-# Arm: ABB manual 3HAC035728 (ranges, 120T speeds). Accelerations: the base moments allow about 70 rad/s^2 on a
-# stretched joint 1; wrist joints are lighter. Gantry: estimates (2 m and 1 m stroke, 2 m/s, 15 m/s^2),
-# centred on the stroke.
-LIMITS = JointLimits(
-    lower=(-1.0, -0.5, *_rad(-165.0, -110.0, -110.0, -160.0, -120.0, -400.0)),
-    upper=(1.0, 0.5, *_rad(165.0, 110.0, 70.0, 160.0, 120.0, 400.0)),
-    velocity=(2.0, 2.0, *_rad(250.0, 250.0, 250.0, 420.0, 590.0, 600.0)),
-    acceleration=(15.0, 15.0, 60.0, 60.0, 60.0, 100.0, 100.0, 120.0),
-    margin=(0.01, 0.01, *_rad(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)),
-    policy_velocity=(2.0, 2.0, *_rad(250.0, 250.0, 250.0, 420.0, 590.0, 600.0)),
-)
 
 
 @dataclass(frozen=True)

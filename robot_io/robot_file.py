@@ -29,7 +29,8 @@ from pydantic import Field, model_validator
 
 from ballmodel.io.ranges import Within
 from ballmodel.io.validation import Finite, Positive, Section, validate
-from robot_io.contract import Contract, JointLimits
+from robot_io.contract import Contract
+from robot_io.limits import JointLimits
 
 Text = Annotated[str, Field(pattern=r"\S")]
 Seconds = Annotated[float, Within(0.0, 1.0, "s")]

@@ -103,6 +103,7 @@ def finetune(
     "practise",
     """\
   mjx-tt practise quickstart --robot rig --rig worn.yaml --seconds 600
+  mjx-tt practise quickstart --robot lockstep --rig worn.yaml --balls 200    as fast as this machine allows
   mjx-tt practise quickstart --robot robot.yaml
 
 Plays as `mjx-tt run` does. Beside the control loop a process of low priority scores every ball about the world that is
@@ -114,7 +115,7 @@ def practise(
     policy: options.PolicyFolder,
     /,
     *,
-    robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" for the emulated robot')],
+    robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" or "lockstep" for the emulated one')],
     balls: Annotated[int | None, count("end after N balls (default: when the operator quits)")] = None,
     rallies: Annotated[int | None, count("end after N rallies that count")] = None,
     seconds: Annotated[float | None, option("S", "end after S seconds")] = None,

@@ -20,11 +20,11 @@ from experiments.config.experiment import Config, Rewards, Task
 from experiments.config.optimiser import Optimiser
 from experiments.errors import ConfigError, error_context
 from mjx_tt.env import user_defined
-from mjx_tt.env.network import Network
 from mjx_tt.env.reward_weights import PRESETS
 from mjx_tt.env.task import CONTRACT_OBSERVATIONS, TaskConfig, weigh_rewards
 from mjx_tt.env.terms import ObservationTerm, RewardTerm
 from mjx_tt.env.user_defined import Definitions
+from mjx_tt.env.user_network import Network
 from mjx_tt.robot import robots
 from mjx_tt.robot.robots import Robot
 from mjx_tt.sim import model as models

@@ -97,12 +97,16 @@ def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
     return build.experiment(trained.config.model_copy(update=changed), str(source))
 
 
+def throws_of(experiment: Experiment, seed: int = 0) -> Throws:
+    """Balls of the experiment's distribution for an emulated robot; ``seed`` draws them."""
+    pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
+    return Throws(*(np.asarray(part, float) for part in (pool.state.position, pool.state.velocity, pool.state.spin)))
+
+
 def lock_step_robot(experiment: Experiment, params: RigParams | None = None, seed: int = 0) -> LockStepRobot:
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
-    pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
     robot = experiment.task.robot
-    throws = Throws(*(np.asarray(part, float) for part in (pool.state.position, pool.state.velocity, pool.state.spin)))
-    return LockStepRobot(throws, params, robot.scene(), robot.contract)
+    return LockStepRobot(throws_of(experiment, seed), params, robot.scene(), robot.contract)
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:

@@ -16,23 +16,19 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from ballmodel.trajectory import Trajectory
 from experiments.deploy import play
 from experiments.deploy.control_session import ControlSession
 from experiments.errors import ConfigError
 from experiments.finetuning import loop
-from experiments.options import RobotOptions
+from experiments.options import LOCK_STEP, RobotOptions
+from experiments.practice import in_lock_step
 from experiments.practice.practice import Exchange
 from experiments.runs.locate import artefact_of, find_policy
-from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.robot import robots
 from robot_io.contract import PAPER
 from robot_io.control.messages import Message, PolicySet, Refused, SetPolicy
 from robot_io.policy.policy import Policy
 
-NICE = 15  # of the process beside the control loop
 LOOK = 5.0  # [s] between two looks at the log
-SETTLED = 1.5  # [s] after a ball's last sample, from which on nothing more of it comes
 RESTART = 10.0  # [s] after which a process that ended is started again
 
 
@@ -54,6 +50,8 @@ def practise(
     source = find_policy(policy)
     if loop.experiment_of(source).task.robot.contract != PAPER:
         raise ConfigError(f"{policy}: expected a policy of the paper's robot, whose worlds can be identified")
+    if robot == LOCK_STEP:
+        return in_lock_step.practise(source, folder, console, setup, updates, balls, seconds)
 
     def accompany(session: ControlSession) -> Companion:
         if session.log_file is None:
@@ -148,10 +146,11 @@ class Companion:
 
 def advise(assignment: Assignment, pipe: Connection) -> None:
     """The process beside: reads the log until the pipe is closed."""
-    os.nice(NICE)
+    _step_back()
     from experiments import options
 
     options.start_jax()
+    from experiments.practice.growing_log import GrowingLog
     from experiments.practice.learner import Learner
     from experiments.practice.practice import Piece, Practice
     from experiments.runs import load_policy
@@ -177,37 +176,7 @@ def advise(assignment: Assignment, pipe: Connection) -> None:
             pipe.send(Advice(exchange.reason, policy, exchange))
 
 
-class GrowingLog:
-    """A session's log while it is written: its new balls at every look, and the joints all along."""
-
-    def __init__(self, first: Path) -> None:
-        self._first = first
-        self._until = -np.inf  # [s] end of the last ball that was taken
-        self._episodes = 0
-
-    def read(self) -> tuple[tuple[Trajectory, ...], list[bool], tuple[JointRecord, ...]]:
-        """Balls that ended since the last look, outcomes known since, and the joints of the last two files."""
-        from experiments.deploy import session_logs
-        from robot_io.log import reader, writer
-        from robot_io.log.messages import LogError
-
-        files = [path for path in writer.parts(self._first) if path.exists()]
-        unfinished = writer.part_of(self._first, len(files) + 1).with_suffix(writer.UNFINISHED)
-        try:
-            logs = [reader.read(path) for path in files[-1:]]
-            logs += [reader.read(unfinished, salvage=True)] if unfinished.exists() else []
-        except (LogError, OSError):  # renamed meanwhile, or nothing in it yet
-            return (), [], ()
-        if not logs:
-            return (), [], ()
-        now = max(log.ball.capture_time.max(initial=-np.inf) for log in logs)
-        tracks = [t for log in logs for t in session_logs.flights(log)]
-        strokes = [s for t in tracks for s in session_logs.split_by_stroke(t)]
-        done = [s for s in strokes if self._until < s.time[-1] < now - SETTLED and len(s) >= 8]
-        done.sort(key=lambda s: s.time[0])
-        if done:
-            self._until = max(s.time[-1] for s in done)
-        ended = [e for log in logs for e in log.episodes if e.outcome]
-        new = [e.outcome == "returned" for e in ended if e.number > self._episodes]
-        self._episodes = max([self._episodes, *(e.number for e in ended)])
-        return tuple(done), new, session_logs.joints_of(logs, robots.paper())
+def _step_back() -> None:
+    """Leaves the processor to everything else: only what is idle, of one core only."""
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})

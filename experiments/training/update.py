@@ -20,9 +20,9 @@ from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
 from mjx_tt.env.episode import MISSED, RETURNED, Episodes
-from mjx_tt.env.network import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
+from mjx_tt.env.user_network import Network
 from mjx_tt.sim import model as models
 from mjx_tt.sim.arguments import Arguments, arguments
 from mjx_tt.sim.model import SimModel

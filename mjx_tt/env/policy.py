@@ -21,7 +21,7 @@ from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
 from mjx_tt.env.episode import Tick
-from mjx_tt.env.network import Network
+from mjx_tt.env.user_network import Network
 from mjx_tt.pytrees import pytree
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.contract import GATED, n_parameters

@@ -22,8 +22,8 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mjx_tt.env.episode import Accumulators, Controller, EpisodeConstants, Episodes, EpisodeState, Return, Tick
-from mjx_tt.env.physics import ENGINES, Physics
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
+from mjx_tt.env.substeps import ENGINES, Physics
 from mjx_tt.env.terms import (
     REDUCTIONS,
     ControlStep,

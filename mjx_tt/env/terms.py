@@ -28,9 +28,9 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
-from mjx_tt.env.network import check_name
+from mjx_tt.env.user_network import check_name
 from mjx_tt.pytrees import pytree
-from robot_io.contract import JointLimits
+from robot_io.limits import JointLimits
 
 # One episode on the robot has plain numbers, a batch in simulation arrays (...).
 Flag: TypeAlias = Bool[Array | np.ndarray, "*batch"] | np.bool_ | bool

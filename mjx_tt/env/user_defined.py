@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from ballmodel.flight import PaddlePose
-from mjx_tt.env.network import Network, check_network
 from mjx_tt.env.reward_weights import TERMS
 from mjx_tt.env.terms import ControlStep, ObservationTerm, PlayedBall, RewardTerm, Sensed
+from mjx_tt.env.user_network import Network, check_network
 from robot_io.contract import CONTROL_RATE, PAPER, Contract
 from robot_io.policy.policy import Policy
 

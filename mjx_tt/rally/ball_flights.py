@@ -21,7 +21,7 @@ from mjx_tt.env.return_flight import FLOOR, take_long_steps
 from mjx_tt.lanes.loop import while_any
 from mjx_tt.pytrees import pytree
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
-from robot_io.contract import LIMITS, JointLimits
+from robot_io.limits import LIMITS, JointLimits
 
 LONGEST = 2.5  # [s] that a ball is followed
 HOME_SPEED, HOME_BRAKING = 0.5, 0.3  # shares of the limits on the way home, the defaults of robot_io.control.bridge

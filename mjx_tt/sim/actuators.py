@@ -36,7 +36,8 @@ from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.vec import Scalars
 from mjx_tt.pytrees import pytree
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES
+from robot_io.limits import LIMITS
 
 # "No limit" as numbers that no drive reaches: ten times the fastest joint's speed, and up to it within 10 microseconds.
 NO_VELOCITY_LIMIT = 10.0 * max(LIMITS.velocity)  # [m/s], [rad/s]

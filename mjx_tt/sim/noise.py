@@ -12,6 +12,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int, UInt32
 
+from mjx_tt.sim.sensors import SensingParams
+
 
 def _hash(x: Array) -> Array:
     x = x ^ (x >> 16)
@@ -29,6 +31,15 @@ def symmetric_uniform(
     bits = [_hash(base + jnp.uint32((i + 1) * 0x85EBCA6B & 0xFFFFFFFF)) for i in range(n)]
     # 24 bits fill a float32 mantissa; the half step keeps the mean at zero.
     return jnp.stack([((b >> 8).astype(jnp.float32) + 0.5) * (2.0**-23) - 1.0 for b in bits])
+
+
+def add_to_ball(
+    ball: Float[Array, "3 *batch"], sensing: SensingParams, seed: UInt32[Array, "*batch"], tick: Int[Array, ""] | int
+) -> Float[Array, "3 *batch"]:
+    """The ball's place as the tracker reports it at a control step: with its noise and its offset."""
+    u = symmetric_uniform(seed, tick, 3).astype(ball.dtype)
+    offset = (sensing.ball_offset_x, sensing.ball_offset_y, sensing.ball_offset_z)
+    return jnp.stack([ball[i] + sensing.ball_noise * u[i] + offset[i] for i in range(3)])
 
 
 def normal(seed: UInt32[Array, "*batch"], counter: Int[Array, ""] | int, skip: int) -> Float[Array, "*batch"]:

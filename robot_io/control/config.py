@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 
 from ballmodel.io.ranges import Within, check_fields
 from robot_io.calibrated import Calibration
-from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
+from robot_io.contract import CONTROL_RATE, PAPER, Contract
 from robot_io.control.observation import ObservationDelays
 from robot_io.devices.egm.messages import N_ARM_JOINTS
 from robot_io.devices.festo import AxesConfig, AxesThread, Axis, AxisProfile, CmmtProfile, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
+from robot_io.limits import LIMITS, JointLimits
 from robot_io.safety.config import SafetyConfig
 
 PROFILES: dict[str, type[CmmtProfile] | type[FhppProfile]] = {"cmmt": CmmtProfile, "fhpp": FhppProfile}

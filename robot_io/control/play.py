@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from robot_io.contract import LIMITS, JointLimits
 from robot_io.control.episode import Episode, EpisodeSummary
 from robot_io.control.rally import Box, RallyCounter, RallyCounts, RallySummary
 from robot_io.control.strokes import Seen, Strokes, in_play
 from robot_io.devices.ball_datagram import BallSample
+from robot_io.limits import LIMITS, JointLimits
 from robot_io.log.messages import Event, Level, Record, episode_end, episode_start, json_text
 
 MAX_STEPS = 200  # control ticks of an episode, as in training

@@ -18,9 +18,10 @@ from typing import Annotated
 import numpy as np
 
 from ballmodel.io.ranges import Within, check_fields
-from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.contract import ABB_JOINTS
 from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor, encode_robot
 from robot_io.emulator.axis_motion import Past
+from robot_io.limits import LIMITS
 
 
 def _arm(values: tuple[float, ...]) -> tuple[float, ...]:

@@ -262,6 +262,10 @@ class FileRecorder(SessionRecorder):
         for record in records:
             self._writer.write(record.pack())
 
+    def flush(self) -> None:
+        """Brings everything so far into the file, for whoever reads it meanwhile."""
+        self._writer.flush()
+
     def close(self) -> Path:
         """Completes the file and returns its path."""
         if self._result is None:

@@ -19,9 +19,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.contract import CONTROL_RATE, LIMITS, JointLimits
+from robot_io.contract import CONTROL_RATE
 from robot_io.errors import JogFirstError, RefusedError, format_error
-from robot_io.limits import limit_velocity
+from robot_io.limits import LIMITS, JointLimits, limit_velocity
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.coasting import Coasting
 from robot_io.safety.config import SLACK

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.contract import JointLimits
+from robot_io.limits import JointLimits
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause

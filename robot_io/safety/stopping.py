@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 
-from robot_io.contract import JOINT_UNITS, JointLimits
+from robot_io.contract import JOINT_UNITS
+from robot_io.limits import JointLimits
 from robot_io.safety.config import SafetyConfig
 
 UNEXPLAINED = {"m": 0.01, "rad": 0.03}  # [m], [rad] from which on a joint does not follow

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from experiments.config.robot import COMMISSIONING
-from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.contract import ABB_JOINTS
 from robot_io.devices.egm.session import DEFAULT_PORT, EgmConfig
 from robot_io.emulator.arm import ArmParams
+from robot_io.limits import LIMITS
 from tests.support.lockstep_play import world
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "abb"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_tt.robot import mjcf
-from robot_io.contract import LIMITS, N_JOINTS
-from robot_io.limits import limit_velocity
+from robot_io.contract import N_JOINTS
+from robot_io.limits import LIMITS, limit_velocity
 
 DT, TICKS, COLUMNS = 1 / 75, 400, 264  # 105,600 requests of eight velocities
 LOWER, UPPER, V_MAX, A_MAX, MARGIN = (

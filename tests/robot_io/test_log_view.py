@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 import mjx_tt
 from robot_io import log
 from robot_io.calibrated import Frame
-from robot_io.contract import JOINT_NAMES, LIMITS, PAPER
+from robot_io.contract import JOINT_NAMES, PAPER
+from robot_io.limits import LIMITS
 from robot_io.log.view import BALL_FRAME, View
 from robot_io.safety.clearance import BLADE, RobotGeometry
 

@@ -2,7 +2,7 @@
 
 SMALL = """
 import jax.numpy as jnp
-from mjx_tt.env.network import network
+from mjx_tt.env.user_network import network
 
 @network("small", shapes={"w1": (11, 16), "b1": (16,), "w2": (16, 8)})
 class Small:

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robot_io.contract import JointLimits
 from robot_io.control.commissioning.homing import towards
+from robot_io.limits import JointLimits
 from robot_io.safety.config import SLACK
 from robot_io.safety.gate import SafetyGate, Sent
 

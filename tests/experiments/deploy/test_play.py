@@ -29,6 +29,7 @@ from robot_io.control import process
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.processes import Rig, free_ports
 from robot_io.errors import JogFirstError, RefusedError
+from robot_io.limits import LIMITS
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
 from robot_io.safety.owner_watch import LONGEST_SILENCE
@@ -73,7 +74,7 @@ def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
     session = log.read(path)
     assert session.metadata and len(session.episodes) == 2
     velocity = session.commands.sent
-    assert np.abs(velocity).max() > 0 and (np.abs(velocity).max(axis=1) <= np.array(contract.LIMITS.velocity)).all()
+    assert np.abs(velocity).max() > 0 and (np.abs(velocity).max(axis=1) <= np.array(LIMITS.velocity)).all()
 
 
 @pytest.mark.realtime

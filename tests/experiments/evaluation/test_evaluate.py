@@ -20,10 +20,11 @@ from experiments.evaluation.human_likeness import likeness
 from mjx_tt.env import reward_weights
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
-from mjx_tt.env.physics import OUT_OF_REACH
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
+from mjx_tt.env.substeps import OUT_OF_REACH
+from robot_io.contract import N_OBSERVATION, n_parameters
+from robot_io.limits import LIMITS
 from tests.mjx_tt.prediction.test_predict import spinning
 from tests.oracles import ball_flight
 

@@ -26,7 +26,7 @@ from mjx_tt.env.task import Task, TaskConfig
 from mjx_tt.robot import mjcf
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
-from robot_io.contract import LIMITS
+from robot_io.limits import LIMITS
 from tests.exam.generator.world import World, fly
 from tests.support.paths import ROOT
 

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mjx_tt.env.physics import OUT_OF_REACH
 from mjx_tt.env.reward_weights import TERMS
+from mjx_tt.env.substeps import OUT_OF_REACH
 from mjx_tt.env.task import CONTRACT_OBSERVATIONS, Task, TaskConfig, weigh_rewards
 from mjx_tt.env.terms import ObservationTerm
 from mjx_tt.robot import mjcf, robots
-from robot_io.contract import LIMITS, N_JOINTS
+from robot_io.contract import N_JOINTS
+from robot_io.limits import LIMITS
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch, fly, on_blade, on_table, path
 from tests.support.scripted_episodes import TICKS, P, Script, episodes, model, play, script, task

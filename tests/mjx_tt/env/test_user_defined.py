@@ -14,7 +14,7 @@ from mjx_tt.env.task import APPROACH_RANGE, TaskConfig, weigh_rewards
 MINE = """
 import jax.numpy as jnp
 from mjx_tt import reward_term
-from robot_io.contract import LIMITS
+from robot_io.limits import LIMITS
 
 @reward_term("slow")
 def slow(step):  # the package's term "velocity", written by hand

@@ -24,7 +24,8 @@ from mjx_tt.rally.end_reasons import End, find_end
 from mjx_tt.rally.human_player import Spread
 from mjx_tt.rally.simulator import Box, RallySimulator, RallyState
 from mjx_tt.sim.model import LATENCIES, SimModel, with_values
-from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, n_parameters
+from robot_io.contract import N_JOINTS, N_OBSERVATION, n_parameters
+from robot_io.limits import LIMITS
 
 CONFIG = TaskConfig(sim_rate=75.0, max_steps=120)  # one substep: compiles in half the time
 LANES = 12

@@ -13,7 +13,7 @@ from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import BISECTIONS, CapsuleClearance
 from mjx_tt.robot.kinematics import PaddleKinematics
-from robot_io.contract import LIMITS
+from robot_io.limits import LIMITS
 
 N = 4000
 MODEL = mjcf.load_model()

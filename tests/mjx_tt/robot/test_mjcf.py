@@ -8,7 +8,8 @@ import pytest
 
 from mjx_tt.robot import mjcf
 from mjx_tt.robot.chain import chain_from_model
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES
+from robot_io.limits import LIMITS
 from tests.oracles.chains import pendulum
 
 

@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_UNITS, LIMITS
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_UNITS
 from robot_io.control.bridge import BridgeState
 from robot_io.emulator.config import RigParams
 from robot_io.errors import RefusedError
+from robot_io.limits import LIMITS
 from robot_io.safety.config import SafetyConfig
 from tests.support.lockstep_play import Wild, lockstep
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS, N_JOINTS
+from robot_io.contract import N_JOINTS
 from robot_io.control.bridge import BridgeState
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.network import NetworkFaults
 from robot_io.errors import RefusedError
+from robot_io.limits import LIMITS
 from robot_io.safety.faults import Cause
 from tests.support.lockstep_play import Hold, Swing, Wild, lockstep, playing
 

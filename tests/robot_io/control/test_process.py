@@ -10,6 +10,7 @@ import pytest
 from robot_io import contract
 from robot_io.control import messages, process
 from robot_io.control.interfaces import BridgeState
+from robot_io.limits import LIMITS
 from robot_io.policy import export
 from robot_io.policy.policy import Policy
 from robot_io.safety.config import SafetyConfig
@@ -118,7 +119,7 @@ def test_an_exception_that_lasts_leaves_the_arm_at_rest_within_its_braking_dista
     for _ in range(300):
         simulation.advance()
     late = DEAD_TIME + SafetyConfig().late + 2 / 75
-    braking = np.abs(velocity) * late + velocity**2 / (2 * np.array(contract.LIMITS.acceleration[2:]))
+    braking = np.abs(velocity) * late + velocity**2 / (2 * np.array(LIMITS.acceleration[2:]))
     assert (np.abs(simulation.arm - place) <= braking + 0.02).all()
     rest = simulation.arm.copy()
     for _ in range(300):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.contract import ABB_JOINTS
 from robot_io.control.observation import joints
 from robot_io.emulator.lockstep import CONTROLLER
+from robot_io.limits import LIMITS
 from robot_io.safety.faults import Cause
 from tests.robot_io.devices.test_egm import packet
 from tests.support.lockstep_play import lockstep

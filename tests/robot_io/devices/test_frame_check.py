@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS
 from robot_io.devices.ball_datagram import BallSample
 from robot_io.devices.frame_check import NEEDED, FrameCheck
 from robot_io.devices.tracker import TrackerConfig
@@ -15,6 +14,7 @@ from robot_io.emulator.config import RigParams
 from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.errors import RefusedError
+from robot_io.limits import LIMITS
 from tests.support.lockstep_play import lockstep, playing
 
 QUARTER = math.pi / 2

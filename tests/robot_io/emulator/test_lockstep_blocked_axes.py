@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS
 from robot_io.control.bridge import BridgeState
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
 from robot_io.errors import JogFirstError
+from robot_io.limits import LIMITS
 from tests.support.lockstep_play import Swing, Wild, playing
 
 JUMP = 0.005  # [m]

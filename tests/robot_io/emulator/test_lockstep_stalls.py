@@ -12,11 +12,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from robot_io.contract import JOINT_UNITS, LIMITS
+from robot_io.contract import JOINT_UNITS
 from robot_io.control.bridge import BridgeState
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
 from robot_io.errors import RefusedError
+from robot_io.limits import LIMITS
 from robot_io.safety.clearance import BLADE
 from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause

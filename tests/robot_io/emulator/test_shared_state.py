@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robot_io.contract import ABB_JOINTS, LIMITS, N_JOINTS
+from robot_io.contract import ABB_JOINTS, N_JOINTS
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.udp import UdpSocket
 from robot_io.emulator import shared_state
@@ -19,6 +19,7 @@ from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.processes import HOST, Rig
 from robot_io.emulator.shared_state import PATIENCE, Motion, Shared
+from robot_io.limits import LIMITS
 from tests.support.lockstep_play import throws
 from tests.support.paths import SCENE
 

@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES
 from robot_io.emulator.opponent import Thrower, Throws
 from robot_io.emulator.world import BALL_RADIUS, PARKED, World, WorldParams
+from robot_io.limits import LIMITS
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch
 from tests.support.paths import SCENE

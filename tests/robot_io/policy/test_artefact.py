@@ -16,6 +16,7 @@ import onnxruntime
 import pytest
 
 from robot_io import contract
+from robot_io.limits import LIMITS
 from robot_io.policy import artefact as artefacts
 from robot_io.policy import export
 from robot_io.policy.artefact import ArtefactError
@@ -175,7 +176,7 @@ def test_the_onnx_file_says_what_its_numbers_are(exported):
     assert json.loads(found["contract"]) == manifest["contract"] and float(found["control_rate_hz"]) == 75.0
     assert found["observation_name"].split(",")[:3] == ["ball_x", "ball_y", "ball_z"]
     assert found["action_name"].split(",") == [row["name"] for row in manifest["contract"]["action"]]
-    assert [float(x) for x in found["action_scale"].split(",")] == list(contract.LIMITS.policy_velocity)
+    assert [float(x) for x in found["action_scale"].split(",")] == list(LIMITS.policy_velocity)
     assert found["action_unit"].split(",")[0] == "m/s"
 
 

@@ -13,7 +13,7 @@ import pytest
 from mjx_tt.robot import clearance, geometry_export, mjcf, robots
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.kinematics import PaddleKinematics
-from robot_io.contract import LIMITS
+from robot_io.limits import LIMITS
 from robot_io.safety import clearance as shipped
 from robot_io.safety.capsules import bound_bulges, box_distance, segment_distance
 from robot_io.safety.clearance import GeometryError, RobotGeometry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot_io.contract import LIMITS
+from robot_io.limits import LIMITS
 from robot_io.safety.coasting import HOLD_AFTER, Coasting
 
 PERIOD, PATIENCE, STEP = 1 / 75, 0.03, np.array(LIMITS.acceleration) / 75

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.contract import ABB_JOINTS
 from robot_io.control.config import axis_range
 from robot_io.devices.egm.messages import encode_sensor
 from robot_io.emulator.arm import ArmController, ArmParams
+from robot_io.limits import LIMITS
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import GateState, SafetyConfig, SafetyGate
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from mjx_tt.robot import mjcf
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES
 from robot_io.errors import RefusedError
-from robot_io.limits import limit_velocity
+from robot_io.limits import LIMITS, limit_velocity
 from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.faults import Cause, FaultLatch

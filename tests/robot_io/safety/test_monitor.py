@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS
 from robot_io.control.bridge import BridgeState
 from robot_io.control.observation import joints
+from robot_io.limits import LIMITS
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS
 from robot_io.control.bridge import BridgeState
 from robot_io.control.commissioning import way_home
+from robot_io.limits import LIMITS
 from robot_io.log.messages import Event, json_text
 from robot_io.log.recorder import NullRecorder
 from robot_io.safety.faults import Cause

@@ -12,7 +12,8 @@ from mjx_tt.diagnosis.joint.coupling import coupling
 from mjx_tt.diagnosis.joint.forward_model import nominal_response
 from mjx_tt.robot import robots
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.contract import JOINT_NAMES
+from robot_io.limits import LIMITS
 
 PLAYED, AFTER = 1.4, 4.0  # [s] of each play; from one's begin to the next one's
 PERIOD = 1.0 / 75.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot_io.contract import LIMITS
 from robot_io.control.bridge import BridgeConfig
 from robot_io.control.commissioning.jog import blade_step, joint_step
 from robot_io.errors import RefusedError
+from robot_io.limits import LIMITS
 from robot_io.safety.clearance import BLADE, RobotGeometry
 from tests.support.lockstep_play import lockstep
 

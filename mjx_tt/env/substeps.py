@@ -205,9 +205,7 @@ class Physics:
             ball = ball + late[None] * captured[3 + n :]
         if constants.camera is not None:
             ball = constants.camera.project(ball)
-        u = noise.symmetric_uniform(episodes.seed, tick, 3).astype(captured.dtype)
-        offset = (tracker.ball_offset_x, tracker.ball_offset_y, tracker.ball_offset_z)
-        ball = jnp.stack([ball[i] + tracker.ball_noise * u[i] + offset[i] for i in range(3)])
+        ball = noise.add_to_ball(ball, tracker, episodes.seed, tick)
         if constants.drives.joint_offset is not None:
             joints = joints + constants.drives.joint_offset
         return Sensed(ball, joints, command)
