@@ -10,7 +10,6 @@ from .env.make import Rollout as Rollout
 from .env.make import load_policy as load_policy
 from .env.make import make as make
 from .env.make import make_rollout as make_rollout
-from .env.network import network as network
 from .env.policy import Policy as Policy
 from .env.policy import initial_theta as initial_theta
 from .env.rollout import RolloutResult as RolloutResult
@@ -21,6 +20,7 @@ from .env.terms import PlayedBall as PlayedBall
 from .env.terms import Sensed as Sensed
 from .env.terms import observation_term as observation_term
 from .env.terms import reward_term as reward_term
+from .env.user_network import network as network
 from .platform import configure as configure
 from .rally.simulator import RallySimulator as RallySimulator
 from .sim.model import ModelFile as ModelFile

@@ -1,15 +1,15 @@
 from .contract import CONTROL_RATE as CONTROL_RATE
 from .contract import JOINT_NAMES as JOINT_NAMES
 from .contract import JOINT_UNITS as JOINT_UNITS
-from .contract import LIMITS as LIMITS
 from .contract import OBSERVATION_NAMES as OBSERVATION_NAMES
 from .contract import OBSERVATION_UNITS as OBSERVATION_UNITS
-from .contract import JointLimits as JointLimits
 from .control.config import RobotConfig as RobotConfig
 from .control.process import ControlOptions as ControlOptions
 from .control.process import start as start
 from .errors import DeviceError as DeviceError
 from .errors import RefusedError as RefusedError
+from .limits import LIMITS as LIMITS
+from .limits import JointLimits as JointLimits
 from .limits import limit_velocity as limit_velocity
 from .policy.artefact import Artefact as Artefact
 from .policy.artefact import ArtefactError as ArtefactError

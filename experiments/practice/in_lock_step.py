@@ -89,6 +89,6 @@ def _put(rig: LockStep, waiting: Exchange | None) -> Exchange | None:
         return None
     policy = load_policy.load(waiting.policy).policy.astype(np.float32)
     with suppress(RefusedError):  # the ball before is still played
-        rig.bridge.set_policy(make_policy("jit", policy, rig.bridge.contract), waiting.version)
+        rig.bridge.set_policy(make_policy("jit", policy, rig.bridge.config.contract), waiting.version)
         return None
     return waiting
