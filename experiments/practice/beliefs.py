@@ -21,10 +21,11 @@ LARGE = 0.1  # of what may change of a parameter, below which it is not named
 NAMED = 3  # parameters in a sentence, at most
 NOISE = "sensing.ball_noise"
 WIDER = 1.5  # times the width of the prior's range, by which a parameter may change either way
+INSTALLED = {path: ends for path, ends in PRIOR.items() if path != NOISE}
 # Half of the range of what may change within a session, by dotted path: worn rubber, another table, a tripod that was
 # kicked, a clock that slipped. Air and ball lift much as before; a fan may be switched on [m/s].
 CHANGES: dict[str, float] = {
-    **{path: WIDER * (high - low) for path, (low, high) in PRIOR.items() if path != NOISE},
+    **{path: WIDER * (high - low) for path, (low, high) in INSTALLED.items()},
     "ball.flight.magnus_coefficient": 0.2,
     "ball.flight.spin_decay": 0.05,
     **{f"ball.flight.wind_{axis}": 1.0 for axis in "xy"},
@@ -53,9 +54,9 @@ def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believe
     """
     before = _distributions(believed)
     if before:
-        ranges = [_about(path, column, CHANGES[path]) for path, column in before.items()]
-    else:  # nothing is known but what an installation may be like
-        ranges = [Range(path, *ends) for path, ends in PRIOR.items() if path != NOISE]
+        ranges = [_about(path, float(column.mean()), CHANGES[path]) for path, column in before.items()]
+    else:  # nothing is known but what an installation may be like, and that something may have changed already
+        ranges = [_about(path, 0.5 * (a + b), max(CHANGES[path], 0.5 * (b - a))) for path, (a, b) in INSTALLED.items()]
     ranges.append(Range(NOISE, *PRIOR[NOISE]))
     found = identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
     samples = next(one for one in found.randomise if isinstance(one, Samples))
@@ -92,8 +93,8 @@ def say(changes: Sequence[Change]) -> str:
     return "; ".join(str(change) for change in changes[:NAMED])
 
 
-def _about(path: str, draws: np.ndarray, half: float) -> Range:
-    return Range(path, float(draws.mean()) - half, float(draws.mean()) + half)
+def _about(path: str, middle: float, half: float) -> Range:
+    return Range(path, middle - half, middle + half)
 
 
 def _distributions(world: ModelFile) -> dict[str, np.ndarray]:
