@@ -21,11 +21,15 @@ LARGE = 0.1  # of what may change of a parameter, below which it is not named
 NAMED = 3  # parameters in a sentence, at most
 NOISE = "sensing.ball_noise"
 WIDER = 1.5  # times the width of the prior's range, by which a parameter may change either way
+RUBBER = {"ball.paddle.restitution": 0.5, "ball.paddle.tangential_gain": 0.5}  # worn, wet, or another one
 INSTALLED = {path: ends for path, ends in PRIOR.items() if path != NOISE}
 # Half of the range of what may change within a session, by dotted path: worn rubber, another table, a tripod that was
 # kicked, a clock that slipped. Air and ball lift much as before; a fan may be switched on [m/s].
 CHANGES: dict[str, float] = {
     **{path: WIDER * (high - low) for path, (low, high) in INSTALLED.items()},
+    # A lag and a delay look alike in most motion: together they may not change as much as each alone.
+    **{path: high - low for path, (low, high) in INSTALLED.items() if path.endswith(".lag")},
+    **RUBBER,
     "ball.flight.magnus_coefficient": 0.2,
     "ball.flight.spin_decay": 0.05,
     **{f"ball.flight.wind_{axis}": 1.0 for axis in "xy"},
@@ -55,8 +59,9 @@ def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believe
     before = _distributions(believed)
     if before:
         ranges = [_about(path, float(column.mean()), CHANGES[path]) for path, column in before.items()]
-    else:  # nothing is known but what an installation may be like, and that something may have changed already
-        ranges = [_about(path, 0.5 * (a + b), max(CHANGES[path], 0.5 * (b - a))) for path, (a, b) in INSTALLED.items()]
+    else:  # nothing is known but what an installation may be like, and that its rubber may be worn
+        halves = {path: RUBBER.get(path, 0.5 * (high - low)) for path, (low, high) in INSTALLED.items()}
+        ranges = [_about(path, 0.5 * sum(INSTALLED[path]), half) for path, half in halves.items()]
     ranges.append(Range(NOISE, *PRIOR[NOISE]))
     found = identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
     samples = next(one for one in found.randomise if isinstance(one, Samples))

@@ -67,7 +67,7 @@ def fit(records: Sequence[JointRecord], model: SimModel, prior: Prior) -> Joints
             action = next(value for path, value in found.items() if path.startswith("latency."))
             for name in part.left:
                 values = {effect: float(found[f"drives.{name}.{effect}"]) for effect in FITTED[:2]}
-                responses[name] = replace(nominal[name], **values, action_delay=float(action))
+                responses[name] = replace(nominal[name], **values, action_delay=max(float(action), 0.0))
     first, second = parts
     size = len(first.mean)
     covariance = np.zeros((size + len(second.mean),) * 2)
