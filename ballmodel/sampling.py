@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, elevation, surface_gap
@@ -195,7 +195,7 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min: Corner, la
 
 @jax.jit
 def _propose(
-    key: Key[Array, ""], params: BallParams, box: dict[str, tuple[Array, ...]]
+    key: PRNGKeyArray, params: BallParams, box: dict[str, tuple[Array, ...]]
 ) -> tuple[Float[Array, "6 n"], Int[Array, " n"]]:
     """Start positions and velocities, and the coarse flight's outcomes."""
     position, velocity = (
@@ -207,7 +207,7 @@ def _propose(
 
 
 def sample_pool(
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     distribution: BallDistribution | BallMixture,
     params: BallParams,
     n: int,
@@ -270,7 +270,7 @@ def sample_pool(
 
 
 def _sample_mixture(
-    key: Key[Array, ""], mixture: BallMixture, params: BallParams, n: int, dt: float, min_acceptance: float
+    key: PRNGKeyArray, mixture: BallMixture, params: BallParams, n: int, dt: float, min_acceptance: float
 ) -> BallPool:
     """Pool of a mixture's balls. Raises ValueError where fewer than ``min_acceptance`` of the proposals are kept."""
     components = [jnp.asarray(a, jnp.float32) for a in (np.log(np.maximum(mixture.weights, 1e-30)), mixture.means.T)]
@@ -288,7 +288,7 @@ def _sample_mixture(
 
 @partial(jax.jit, static_argnames=("n", "short"))
 def _fill(
-    key: Key[Array, ""],
+    key: PRNGKeyArray,
     params: BallParams,
     log_weights: Float[Array, " k"],
     means: Float[Array, "9 k"],

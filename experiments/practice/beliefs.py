@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from experiments.config.prior import PRIOR
 from experiments.study import identification
 from experiments.study.analysis import delays
 from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.diagnosis.together import balls as of_balls
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
 from mjx_tt.sim.randomisation import Range, Samples
@@ -19,7 +20,7 @@ from mjx_tt.sim.randomisation import Range, Samples
 SURE = 4.0  # deviations by which a parameter that is named has moved
 LARGE = 0.1  # of what may change of a parameter, below which it is not named
 NAMED = 3  # parameters in a sentence, at most
-NOISE = "sensing.ball_noise"
+NOISE, LIFT = "sensing.ball_noise", of_balls.LIFT
 WIDER = 1.5  # times the width of the prior's range, by which a parameter may change either way
 RUBBER = {"ball.paddle.restitution": 0.5, "ball.paddle.tangential_gain": 0.5}  # worn, wet, or another one
 INSTALLED = {path: ends for path, ends in PRIOR.items() if path != NOISE}
@@ -30,7 +31,7 @@ CHANGES: dict[str, float] = {
     # A lag and a delay look alike in most motion: together they may not change as much as each alone.
     **{path: high - low for path, (low, high) in INSTALLED.items() if path.endswith(".lag")},
     **RUBBER,
-    "ball.flight.magnus_coefficient": 0.2,
+    LIFT: 0.2,
     "ball.flight.spin_decay": 0.05,
     **{f"ball.flight.wind_{axis}": 1.0 for axis in "xy"},
 }
@@ -54,7 +55,8 @@ class Change:
 def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believed: ModelFile) -> ModelFile:
     """The world after these balls, hits among them, and the joints meanwhile. Raises ValueError where they are few.
 
-    What these logs do not decide is drawn as before, at first from the prior: one program takes all worlds.
+    What these logs do not decide is drawn as before, at first from the prior: one program takes all worlds. A parameter
+    that is known no better than before is not decided: a fit that went astray says so by its uncertainty.
     """
     before = _distributions(believed)
     if before:
@@ -65,17 +67,20 @@ def identify(balls: Sequence[Trajectory], joints: Sequence[JointRecord], believe
     ranges.append(Range(NOISE, *PRIOR[NOISE]))
     found = identification.identify_world(balls, joints, [(balls, joints)] if joints else [], believed, ranges)
     samples = next(one for one in found.randomise if isinstance(one, Samples))
-    rng = np.random.default_rng(len(balls))
-    columns = dict(zip(samples.paths, samples.values.T, strict=True))
-    for path in CHANGES:
-        if path not in columns and path != delays.ARM:
-            low, high = PRIOR.get(path, (0.0, 0.0))
-            columns[path] = before.get(path, rng.uniform(low, high, len(samples.values)))
+    known = {one.path: (one.high - one.low) / 12**0.5 for one in ranges}
+    drawn = zip(samples.paths, samples.values.T, strict=True)
+    decided = {path: column for path, column in drawn if column.std() < known.get(path, np.inf)}
+    columns, rng = dict(decided), np.random.default_rng(len(balls))
+    for path in sorted(CHANGES.keys() - decided.keys() - {delays.ARM}):
+        low, high = PRIOR.get(path, (0.0, 0.0))
+        columns[path] = before.get(path, rng.uniform(low, high, len(samples.values)))
     ordered = sorted(columns)
     whole = Samples(tuple(ordered), np.stack([columns[path] for path in ordered], axis=1), samples.weight)
     others = tuple(one for one in found.randomise if not set(one.paths) & columns.keys())
-    centre = {path: float(column.mean()) for path, column in columns.items()}
-    return ModelFile(models.with_values(found.model, centre), (whole, *others), found.provenance)
+    values = {path: float(column.mean()) for path, column in columns.items()}
+    if LIFT not in decided:  # nor is the spin, of which a flight shows the product with it
+        values |= {f"ball_spin.{name}": float(value) for name, value in asdict(believed.model.ball_spin).items()}
+    return ModelFile(models.with_values(found.model, values), (whole, *others), found.provenance)
 
 
 def compare(before: ModelFile, after: ModelFile) -> tuple[Change, ...]:

@@ -6,12 +6,12 @@ Batch axis last; (L,) unless noted.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from ballmodel import constants as c
 from ballmodel import flight
@@ -116,7 +116,10 @@ def fly_to_player(
 
 
 def drive_home(
-    home: ArrayLike, qpos: Float[Array, "joints L"], seconds: Float[Array, " L"], limits: JointLimits = LIMITS
+    home: Sequence | np.ndarray,
+    qpos: Float[Array, "joints L"],
+    seconds: Float[Array, " L"],
+    limits: JointLimits = LIMITS,
 ) -> Float[Array, "joints L"]:
     """Joint positions (n, L) ``seconds`` (L,) after the hit, on the way home (n,) as the bridge drives it."""
     speed, braking = HOME_SPEED * make_column(limits.policy_velocity), HOME_BRAKING * make_column(limits.acceleration)
@@ -130,6 +133,6 @@ def drive_home(
     return qpos + jnp.sign(error) * jnp.clip(moved, 0.0, distance)
 
 
-def make_column(values: ArrayLike) -> Float[Array, "joints 1"]:
+def make_column(values: Sequence | np.ndarray) -> Float[Array, "joints 1"]:
     """Numbers of the joints as (n, 1)."""
     return jnp.asarray(np.asarray(values, np.float32))[:, None]

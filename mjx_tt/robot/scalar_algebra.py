@@ -7,12 +7,11 @@ Vectors are 3-tuples of scalars, matrices 3-tuples of rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeAlias, TypeVar
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
 
 Scalar: TypeAlias = float | jax.Array
 Vector: TypeAlias = tuple[Scalar, Scalar, Scalar]
@@ -154,13 +153,13 @@ def are_signs(*nested: Vector | Matrix) -> bool:
     return all(entry in (-1.0, 0.0, 1.0) for entry in jax.tree.leaves(nested))
 
 
-def vector(values: ArrayLike) -> Constant:
+def vector(values: Sequence | np.ndarray) -> Constant:
     """Three numbers as floats."""
     x, y, z = np.asarray(values, float)
     return float(x), float(y), float(z)
 
 
-def matrix(values: ArrayLike) -> ConstantMatrix:
+def matrix(values: Sequence | np.ndarray) -> ConstantMatrix:
     """3 x 3 numbers as nested floats."""
     x, y, z = np.asarray(values, float)
     return vector(x), vector(y), vector(z)

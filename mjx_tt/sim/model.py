@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import yaml
 from jax import Array
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 from typing_extensions import TypedDict
 
 from ballmodel.flight import BallParams, ball_params
@@ -196,14 +196,14 @@ def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
 
 
 def draw(
-    key: Key[Array, ""], model: SimModel, randomise: tuple[Randomised | Drawing, ...], shape: tuple[int, ...]
+    key: PRNGKeyArray, model: SimModel, randomise: tuple[Randomised | Drawing, ...], shape: tuple[int, ...]
 ) -> SimModel:
     """The model with all that is randomised drawn for a batch of ``shape`` episodes."""
     return with_values(model, randomisation.drawn(key, randomise, shape))
 
 
 def draw_latencies(
-    key: Key[Array, ""], latency: LatencyParams, shape: tuple[int, ...], longest: Float[Array, "5 *#batch"] | float
+    key: PRNGKeyArray, latency: LatencyParams, shape: tuple[int, ...], longest: Float[Array, "5 *#batch"] | float
 ) -> Float[Array, "5 *batch"]:
     """Delays (5, *shape) [s] in the order of ``LATENCIES``, kept within [0, longest]."""
     mean = jnp.stack([jnp.broadcast_to(getattr(latency, n), shape) for n in LATENCIES])
@@ -211,7 +211,7 @@ def draw_latencies(
     return jnp.clip(mean + std * jax.random.normal(key, mean.shape), 0.0, longest)
 
 
-def draw_spin(key: Key[Array, ""], spin: BallSpinParams, shape: tuple[int, ...]) -> Float[Array, "3 *batch"] | None:
+def draw_spin(key: PRNGKeyArray, spin: BallSpinParams, shape: tuple[int, ...]) -> Float[Array, "3 *batch"] | None:
     """Spin (3, *shape) [rad/s] of incoming balls; None where no ball spins, so that nothing is added."""
     values = dataclasses.astuple(spin)
     if all(isinstance(value, int | float) and value == 0.0 for value in values):

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Key
+from jaxtyping import Float, PRNGKeyArray
 from pydantic import AfterValidator
 from typing_extensions import TypedDict
 
@@ -56,7 +56,7 @@ class Range:
         """The value for numbers drawn uniformly from [0, 1)."""
         return {self.path: self.low + (self.high - self.low) * uniform}
 
-    def drawn(self, key: Key[Array, ""], shape: tuple[int, ...]) -> dict[str, Array]:
+    def drawn(self, key: PRNGKeyArray, shape: tuple[int, ...]) -> dict[str, Array]:
         """Values of a batch of ``shape`` episodes."""
         return {self.path: jax.random.uniform(key, shape, minval=self.low, maxval=self.high)}
 
@@ -75,7 +75,7 @@ class Rows:
         row = jnp.minimum(jnp.searchsorted(self.share, uniform, side="right"), self.share.shape[0] - 1)
         return {path: jnp.asarray(self.values)[i, row] for i, path in enumerate(self.paths)}
 
-    def drawn(self, key: Key[Array, ""], shape: tuple[int, ...]) -> dict[str, Array]:
+    def drawn(self, key: PRNGKeyArray, shape: tuple[int, ...]) -> dict[str, Array]:
         """Values of a batch of ``shape`` episodes."""
         return self.at(jax.random.uniform(key, shape))
 
@@ -119,7 +119,7 @@ Randomised: TypeAlias = Range | Samples
 Drawing: TypeAlias = Range | Rows
 
 
-def drawn(key: Key[Array, ""], randomise: Sequence[Randomised | Drawing], shape: tuple[int, ...]) -> dict[str, Array]:
+def drawn(key: PRNGKeyArray, randomise: Sequence[Randomised | Drawing], shape: tuple[int, ...]) -> dict[str, Array]:
     """Values by dotted path for a batch of ``shape`` episodes."""
     keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
     values: dict[str, Array] = {}
