@@ -66,7 +66,7 @@ class BallDistribution:
         }
         return {"name": self.name, "source": self.source, **intervals, **_short(self.short_balls)}
 
-    def _ends(self, part: str) -> tuple[Sequence[float], Sequence[float]]:
+    def _ends(self, part: str) -> tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]:
         return getattr(self, f"{part}_min"), getattr(self, f"{part}_max")
 
 

@@ -124,7 +124,7 @@ def _meets(before: States, after: States) -> np.ndarray:
     return over & (before[2] > BALL_RADIUS) & (after[2] <= BALL_RADIUS)
 
 
-def _bounce(before: States, after: States, dt: np.ndarray, physics: Physics) -> States:
+def _bounce(before: States, after: States, dt: np.ndarray | float, physics: Physics) -> States:
     """The states after a step in which the table is met; a share beyond the step is as good, for slopes."""
     fallen = before[2] - after[2]
     share = (before[2] - BALL_RADIUS) / np.where(np.abs(fallen) > 1e-9, fallen, 1e-9)

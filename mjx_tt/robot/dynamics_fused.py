@@ -12,12 +12,10 @@ result equals MuJoCo C's to rounding.
 from __future__ import annotations
 
 import numpy as np
-from jax import Array
-from jaxtyping import Float
 
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import Chain, Link
-from mjx_tt.robot.kinematics import Joints, centred_on_anchors, joint_transforms, stack
+from mjx_tt.robot.kinematics import Controls, Joints, centred_on_anchors, joint_transforms, stack
 
 
 class FusedEngine:
@@ -31,7 +29,7 @@ class FusedEngine:
         gravcomp = {link.gravcomp for link in chain.links if link.mass > 0.0}
         self._uniform_gravcomp = gravcomp.pop() if len(gravcomp) == 1 else None
 
-    def step(self, qpos: Joints, qvel: Joints, ctrl: Float[Array, "actuators *batch"]) -> tuple[Joints, Joints]:
+    def step(self, qpos: Joints, qvel: Joints, ctrl: Controls) -> tuple[Joints, Joints]:
         """One step. qpos [m]/[rad], qvel [m/s]/[rad/s], ctrl in the actuators' units: each (n, ...)."""
         h = self.timestep
         acceleration = _articulated_body(self._chain, h, self._uniform_gravcomp, qpos, qvel, ctrl)
@@ -46,7 +44,7 @@ def _spatial_inertia(link: Link) -> tuple[f.Matrix, f.Matrix, f.Matrix]:
     return f.matrix(about_origin), f.matrix(link.mass * c), f.matrix(link.mass * np.eye(3))
 
 
-def _joint_force(link: Link, i: int, qpos: Joints, qvel: Joints, ctrl: Joints) -> f.Scalar:
+def _joint_force(link: Link, i: int, qpos: Joints, qvel: Joints, ctrl: Controls) -> f.Scalar:
     force = f.mul(link.bias_qvel - link.damping, qvel[i])
     if link.ctrl_index >= 0:
         force = f.add(force, f.mul(link.gain, ctrl[link.ctrl_index]))
@@ -71,7 +69,12 @@ def _shifted(A: f.Matrix, PBt: f.Matrix, PC: f.Matrix, P: f.Matrix) -> f.Matrix:
 
 
 def _articulated_body(
-    chain: Chain, h: float, uniform_gravcomp: float | None, qpos: Joints, qvel: Joints, ctrl: Joints
+    chain: Chain,
+    h: float,
+    uniform_gravcomp: float | None,
+    qpos: Joints,
+    qvel: Joints,
+    ctrl: Controls,
 ) -> list[f.Scalar]:
     links, n = chain.links, len(chain.links)
     # By joint: articulated inertia (rotational, coupling and translational blocks), bias force (moment, force),

@@ -16,6 +16,7 @@ from mjx_tt.lanes.functions import sin_cos
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
+Controls: TypeAlias = Float[jax.Array, "actuators *batch"]  # in the actuators' units
 Joints: TypeAlias = Float[jax.Array, "n *batch"]  # [m], [m/s] of slides, [rad], [rad/s] of hinges
 
 

@@ -110,7 +110,7 @@ def sort_by_effect(
     return JointDrive(**{effect: column(effect) for effect in EFFECTS})
 
 
-def rest(drives: JointDrive, qpos: Float[Array, "..."]) -> DriveState:
+def rest(drives: JointDrive, qpos: Float[Array, "joints *batch"]) -> DriveState:
     """The drives of a robot that stands at qpos (n, ...), in the middle of every play."""
     at_once = drives.lag is None and drives.acceleration_limit is None  # the velocity is what is commanded
     return DriveState(

@@ -203,10 +203,10 @@ def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end(
     path = 0.3 * np.sin(4 * t)
     with jax.enable_x64(True):
         effect = effects(backlash=jnp.array(0.1))
-        state, carried = actuators.rest(effect, jnp.array(path[0])), [path[0]]
+        state, carried = actuators.rest(effect, jnp.array(path[:1])), [path[0]]
         for q in path[1:]:
-            output, velocity, state = actuators.step_backlash(effect, state, jnp.array(q), jnp.array(0.0), H)
-            assert float(velocity) == pytest.approx((float(output) - carried[-1]) / H, abs=1e-12)
-            carried.append(float(output))
+            output, velocity, state = actuators.step_backlash(effect, state, jnp.array([q]), jnp.zeros(1), H)
+            assert float(velocity[0]) == pytest.approx((float(output[0]) - carried[-1]) / H, abs=1e-12)
+            carried.append(float(output[0]))
     np.testing.assert_allclose(carried, play_in(0.1, path), atol=1e-12)
     assert max(carried) == pytest.approx(0.3 - 0.05, abs=1e-4)  # the amplitude loses half the play
