@@ -146,14 +146,14 @@ def fit_human(
     """The 16 numbers of a person's balls, from trajectories or from start states.
 
     A ball counts when it starts on the human's side, flies towards the robot, clears the net and lands on the robot's
-    side: where a bounce was measured there, or else by the start's simulated flight.
+    side. The bounce that was measured there decides; if there is none, the flight simulated from the start does.
     eps, min_samples: see ``fit_distribution``.
     serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
     recording may spin; trajectories are taken not to (``mjx_tt.prediction`` estimates their spins).
     fit: of trajectories. Both minimise the same distance, "nelder-mead" as the paper does, "gauss-newton" all at once.
     both_players: strokes of the other player count as well, as if played from the human's side.
     short_balls: the distribution draws balls as well that would bounce twice on the robot's side, if the person played
-    any; without, those set its bounds only, and none of them is drawn.
+    any. If False, such balls widen its bounds, but none of them is drawn.
     progress: called with (flights fitted so far, all of them) by Nelder-Mead, which takes a tenth of a second for each.
     Raises ValueError for another fit, for Nelder-Mead on start states and when no ball is left.
     """

@@ -70,11 +70,11 @@ def finetune(
     operator: Operator | None = None,
     experiment: Experiment | None = None,
 ) -> dict[str, Any] | None:
-    """Fine-tunes the policy of a run or an artefact, or continues to; returns the evaluation's report.
+    """Starts or continues fine-tuning the policy of a run or an artefact; returns the evaluation's report.
 
-    None: the operator stopped it, and the same call continues. experiment: what ``source`` was trained in, looked up
-    when it is not given. Raises RunError, ConfigError, CheckpointError or ArtefactError with a message for the person
-    at the terminal, and what the robot raises.
+    Returns None if the operator stopped it; the same call then continues. experiment: what ``source`` was trained in,
+    looked up when it is not given. Raises RunError, ConfigError, CheckpointError or ArtefactError with a message for
+    the person at the terminal, and what the robot raises.
     """
     experiment = experiment or experiment_of(source)
     run.folder.mkdir(parents=True, exist_ok=True)

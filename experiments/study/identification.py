@@ -52,13 +52,13 @@ def identify(
     hits: Sequence[Path] = (),
     seconds: float = 60.0,
 ) -> ModelFile:
-    """The world to train in after these logs; its provenance says what it was made of.
+    """The world to train in after these logs.
 
-    Of that: flights, hits (0: the rubber is drawn from the prior), the deviation [rad], [m] of each joint that nothing
-    explains, and whether the fit of the balls settled: else it still moved when its rounds were over.
+    Its provenance holds the number of flights and of hits (0: the rubber is drawn from the prior), the deviation [rad],
+    [m] of each joint that nothing explains, and whether the fit of the balls converged within its rounds.
 
-    most: balls that are looked at; believed: the model so far; before: ranges of what may be wrong of it, used where
-    the logs say nothing, of the drives as well where no log of joints is given; hits: folders that ``write_hits`` made;
+    most: balls that are looked at; believed: the model so far; before: prior ranges of its errors, used for what the
+    logs do not show; without a log of joints this includes the drives; hits: folders that ``write_hits`` made;
     seconds: of the joints' motion that are looked at, in the middle of a longer log. Raises ValueError naming the log
     at fault.
     """

@@ -308,8 +308,8 @@ def choose(
     """The likeliest set, as long as each of its causes takes away LEAST_SHARE of an error.
 
     A set that was chosen before stays unless another is clearly better. early: sizes do not count yet.
-    errors_of: mean squares beside a set; nominal: of the nominal model; level: of the noise; nothing: too small to
-    divide by.
+    errors_of: mean square errors with a set of causes. nominal, level: mean squares of the nominal model and of the
+    noise. nothing: the smallest divisor.
     """
     path = model.best(MOST_CAUSES)
     beside = [model.beside(s) for s in path]

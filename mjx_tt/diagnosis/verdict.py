@@ -166,9 +166,9 @@ def combined(
 ) -> tuple[Verdict, dict[str, float], tuple[Randomised, ...]]:
     """Verdict of all parts, and values of the extended model with what training may draw around them.
 
-    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
-    something unexplained changes nothing unless it was adopted; nor does what predicts worse. notes:
-    warnings that stand before the parts' own.
+    The verdict has room for one unexplained and one held-out error: that of the first part that has one. A part with
+    something unexplained changes the extended model only if its causes were adopted. A part that predicts worse changes
+    nothing. notes: warnings that stand before the parts' own.
     """
 
     def every(name: str) -> tuple:

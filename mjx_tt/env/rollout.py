@@ -88,8 +88,8 @@ class Simulator:
     ) -> Episodes:
         """Balls, latencies, noise seeds and randomised parameters of repeats x columns episodes.
 
-        Within each column the episodes are in the order of the balls' arrival. What the model leaves at its nominal
-        value and a program can do without is None in the episodes' model.
+        Within each column the episodes are in the order of the balls' arrival. Optional parameters
+        that are at their nominal value are None in the episodes' model.
         """
         if model.drives is not None and model.joints != self.task.contract.joints:
             wanted = self.task.contract.joints

@@ -13,8 +13,8 @@ class Coasting:
     """The last tick's reference and velocity. Times are seconds of one monotonic clock, passed in.
 
     A motion that no tick renews for ``patience`` seconds slows down at the acceleration limits by itself, one step a
-    period, along the very way that the gate has proven clear: whatever has broken the ticks is not asked, neither gate
-    nor devices.
+    period, along the very way that the gate has proven clear. It uses neither the gate nor the devices, because one
+    of them may have stopped the ticks.
     """
 
     def __init__(self, period: float, patience: float, acceleration: np.ndarray) -> None:

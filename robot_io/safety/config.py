@@ -39,14 +39,15 @@ class SafetyConfig:
                      more than the limiter's margin
     escape_speed     share of the velocity limits while a gap is smaller than its margin
     still            measured speed (8,) above which the robot counts as moving and is not armed
-    overspeed        measured speed over its limit that is a fault; ``monitor.UNSCALED`` is added to a scaled limit
+    overspeed        ratio of measured speed to its limit above which there is a fault; ``monitor.UNSCALED`` is added to
+                     a scaled limit
     following_error  distance (8,) of a measured position from everywhere the reference was in the last ``delay``
     drive_delay      (8,) time from a command to the motion that it makes, lag included
     drive_delay_error  by which the delay of the arm and that of the linear axes may be wrong, each
     feedback_delay   longest time from a motion to its measurement here
     following_ticks  commands in a row after which a following error is a fault
-    late             longest time between two commands: so long the robot may go on with the last one, and that way and
-                     braking after it are proven clear as well; more is a fault
+    late             longest time between two commands; more is a fault. The robot may continue with the last command
+                     for this long: this path and the braking after it are proven clear
     silence          (8,) [s] for which each device goes on with its last command where none follows: the lead of a
                      linear axis's target, CommTimeout of the arm's controller. What it leads to touches nothing
     stale_*          longest age of what was last heard of a device, and of the policy's request; the tracker's is over

@@ -293,7 +293,7 @@ class SafetyGate:
             self.condition(cause, not age <= allowed, sentence, now)
 
     def command(self, request: ArrayLike, measured: ArrayLike, measured_velocity: ArrayLike, now: float) -> Sent:
-        """One control tick: requested, measured velocity and measured position, each (8,), to what has to be sent.
+        """One control tick: from requested velocity, measured velocity and position, each (8,), to the command to send.
 
         Never raises: whatever is wrong with the inputs is a fault, and what comes back then is the braked motion.
         """
