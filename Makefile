@@ -62,7 +62,7 @@ TURN     ?= $(shell git rev-list --count HEAD 2>/dev/null || echo 0)
 PART      = --splits $(SHARDS) --group $(shell echo $$(($(TURN) % $(SHARDS) + 1))) --durations-path tests/durations.json
 STUDY    := tests/experiments/study
 test-slow: $(READY)
-	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "deferred and not realtime" $(PART)
+	$(PYTEST) $(PARALLEL) $(STRICT) -m "deferred and not realtime" $(PART)
 	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "deferred and not realtime" $(PART)
 	$(PYTEST) $(PARALLEL) tests --ignore=$(STUDY) -m "slow and not realtime" $(PART)
 	USERS_FUSION=1 $(PYTEST) $(PARALLEL) $(STUDY) -m "slow and not realtime" $(PART)

@@ -20,7 +20,7 @@ from mjx_tt.diagnosis.ball.diagnose import flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import marginal, noise
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading
-from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
+from mjx_tt.diagnosis.ball.flights.forward_model import PAD, Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.diagnosis.hits.diagnose import FARTHEST, compare_returns, spread, watched_hits
@@ -82,7 +82,8 @@ class Scorer:
 
     def _grid(self, kind: str, balls: Sequence[Trajectory]) -> Grid:
         """On a grid of the largest size so far: one compiled program for all that follow."""
-        g = grid(balls, *self._sizes.get(kind, (0, 0)))
+        most = -(-max(map(len, balls)) // PAD) * PAD
+        g = grid(balls, *self._sizes.get(kind, (0, most)))
         self._sizes[kind] = len(g.steps), len(g.time)
         return g
 

@@ -18,6 +18,7 @@ from robot_io.log import read
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_the_worn_rubber_is_identified_from_the_log_while_it_is_written(tmp_path):
     rig = tmp_path / "worn.yaml"
     rig.write_text("world: {paddle_restitution: 0.5}\n")

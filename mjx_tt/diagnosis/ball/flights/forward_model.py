@@ -28,7 +28,7 @@ from mjx_tt.sim.model import SensingParams, SimModel, paths, with_values
 from mjx_tt.sim.sensors import FILTER_GATE, SURPRISE, Lag, jump
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
-PAD = 16  # numbers of steps and samples are rounded up to it, so that similar logs share one compiled program
+PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
 WIDTH = 256  # columns, balls x variants, of one call: always the same, for the same reason; few enough to stay in cache
 _FLOWN: set[tuple] = set()  # shapes of programs that were compiled
 
@@ -59,7 +59,7 @@ class Grid:
 def grid(trajectories: Sequence[Trajectory], steps: int = 0, samples: int = 0) -> Grid:
     """Puts trajectories on one padded grid, of at least so many steps and samples."""
     counts = [np.maximum(np.ceil(np.diff(t.time) / LONGEST_STEP * (1.0 - 1e-9)), 1.0).astype(int) for t in trajectories]
-    n, samples = len(trajectories), -(-max(samples, *map(len, trajectories)) // PAD) * PAD
+    n, samples = len(trajectories), max(samples, *map(len, trajectories))
     length = -(-max(steps, *(int(c.sum()) for c in counts)) // PAD) * PAD
     step, index, time = np.zeros((length, n)), np.zeros((samples, n), int), np.zeros((samples, n))
     measured, mask = np.zeros((3, samples, n)), np.zeros((samples, n), bool)
