@@ -1,46 +1,46 @@
-"""A whole practice on the emulated robot, whose physics is MuJoCo C's: its rubber is worn, and nobody says so."""
+"""A log that is read while the emulated robot plays and writes it, against what the finished log holds."""
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from rich.console import Console
 
-from experiments.options import RobotOptions
-from experiments.practice import in_lock_step
+from experiments.finetuning import loop
 from experiments.practice.growing_log import GrowingLog
+from experiments.runs import load_policy
 from experiments.runs.locate import find_policy
-from mjx_tt.sim.model import ModelFile
-from mjx_tt.sim.randomisation import Samples
+from robot_io.emulator.lockstep import LockStep
 from robot_io.log import read
+from robot_io.log.recorder import FileRecorder
+from robot_io.policy.backends import make_policy
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
-def test_the_worn_rubber_is_identified_from_the_log_while_it_is_written(tmp_path):
-    rig = tmp_path / "worn.yaml"
-    rig.write_text("world: {paddle_restitution: 0.5}\n")
-    status = in_lock_step.practise(
-        find_policy("quickstart"),
-        tmp_path,
-        Console(quiet=True),
-        RobotOptions(rig=str(rig), seed=1),
-        updates=2,
-        balls=45,
-    )
-    assert status == 0
-    (log,) = tmp_path.glob("*.mcap")
-    lines = (log.with_suffix("") / "journal.jsonl").read_text().splitlines()
-    events = [json.loads(line) for line in lines]
-    identified = next(event for event in events if event["event"] == "identified")
-    world = ModelFile.load(log.with_suffix("") / identified["world"])
-    (samples,) = (one for one in world.randomise if isinstance(one, Samples))
-    rubber = samples.values[:, samples.paths.index("ball.paddle.restitution")]
-    assert 0.4 < np.median(rubber) < 0.62  # believed: 0.917; the prior ends at 0.83
-    assert [event["event"] for event in events][:2] == ["identified", "trained"]
-    # Nothing was lost or taken twice: what came in pieces is what the finished log holds.
-    balls, returned, joints = GrowingLog(log).read()
-    assert len(returned) == sum(bool(episode.outcome) for episode in read(log).episodes)
-    assert len({ball.time[0] for ball in balls}) == len(balls) and len(joints) == 8
+def test_what_comes_in_pieces_is_what_the_finished_log_holds(tmp_path):
+    source = find_policy("quickstart")
+    experiment, policy = loop.experiment_of(source), load_policy.load(source).policy.astype(np.float32)
+    robot, pieces, returned = experiment.task.robot, [], []
+    growing = GrowingLog(tmp_path / "play.mcap")
+    assert growing.read() == ((), [], ())  # nothing is there yet
+    with FileRecorder(tmp_path, "play", {}) as recorder:
+        rig = LockStep(
+            robot.scene(),
+            loop.throws_of(experiment, 1),
+            make_policy("numpy", policy, robot.contract),
+            recorder=recorder,
+        )
+        rig.start()
+        rig.throwing = True
+        for _ in range(6):
+            rig.run(2.5)
+            recorder.flush()
+            balls, outcomes, joints = growing.read()
+            pieces += balls
+            returned += outcomes
+    log = read(tmp_path / "play.mcap")
+    whole, all_returned, _ = GrowingLog(tmp_path / "play.mcap").read()
+    assert len(pieces) >= 3 and len(joints) == 8
+    assert [b.time[0] for b in pieces] == [b.time[0] for b in whole][: len(pieces)]
+    for piece, ball in zip(pieces, whole, strict=False):
+        np.testing.assert_array_equal(piece.position, ball.position)
+    assert returned == all_returned[: len(returned)] == [e.outcome == "returned" for e in log.episodes][: len(returned)]
