@@ -26,9 +26,6 @@ from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 
 ROUNDS = 7
-# Of them, in which bounces scatter as was said: a table that is far from the believed one would pass for one whose
-# bounces scatter widely, and no bounce would tell anything of it any more.
-UNSCATTERED = 2
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 NEARLY_SETTLED = 1.0  # the same, where no share of the step is any better: it was Laplace's approximation that pulled
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
@@ -92,7 +89,7 @@ def fit(
         linear = problem.linearise(at)
         most = MEMORY[-1] if near else MEMORY[min(round_, len(MEMORY) - 1)]
         own = _noise(linear, g, prior, most, scatter)
-        shown, own, prior = _evidence(problem, linear, at, own, prior, free, near or round_ >= UNSCATTERED)
+        shown, own, prior = _evidence(problem, linear, at, own, prior, free)
         # Lift and spins are told apart by small differences: not before all else is about right.
         moving = [i for i in free if round_ >= held or effects[i].path != MAGNUS]
         theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem)
@@ -140,22 +137,12 @@ def _noise(linear: Linear, g: Grid, spins: SpinPrior | None, memory: float, scat
 
 
 def _evidence(
-    problem: BallProblem,
-    linear: Linear,
-    at: Situation,
-    own: Noise,
-    prior: SpinPrior | None,
-    free: list[int],
-    scatters: bool,
+    problem: BallProblem, linear: Linear, at: Situation, own: Noise, prior: SpinPrior | None, free: list[int]
 ) -> tuple[Evidence, Noise, SpinPrior | None]:
-    """Evidence about all effects, with the most likely distributions of spins and, in the noise, of kicks.
-
-    scatters: how bounces scatter is asked as well; else it stays as it is.
-    """
+    """Evidence about all effects, with the most likely distributions of kicks, in the noise, and of spins."""
     flights = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, problem.grid), problem)
     p = marginal.products(linear, flights)
-    prior, found = marginal.distributions(p, at.theta, prior, own.scatter)
-    scatter = found if scatters else own.scatter
+    prior, scatter = marginal.distributions(p, at.theta, prior, own.scatter)
     physical = [i for i in free if problem.effects[i].path.startswith((FLIGHT, TABLE))]  # all others are the cameras'
     more = None if prior is None else marginal.growth(problem, flights, linear, at, physical)
     return marginal.evidence(p, at.theta, prior, scatter, more), replace(own, scatter=scatter), prior
