@@ -14,7 +14,6 @@ import numpy as np
 from jax.sharding import PartitionSpec
 from rich.console import Console
 
-from ballmodel.distribution import save_distribution
 from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
 from experiments.config import build, experiment, files
@@ -94,14 +93,7 @@ class Learner:
         return (result.outcome == RETURNED) & result.finite
 
 
-def save_balls(balls: Balls, path: Path) -> Path:
-    """Writes a person's distribution where a training finds it."""
-    save_distribution(path, balls)
-    return path
-
-
 def _wide(policy: Policy) -> Policy:
     """The policy on every column of balls."""
-    parts = (jnp.asarray(part, jnp.float32) for part in (policy.theta, policy.mean, policy.inv_std))
-    theta, mean, inv_std = parts
+    theta, mean, inv_std = (jnp.asarray(x, jnp.float32) for x in (policy.theta, policy.mean, policy.inv_std))
     return Policy(jnp.repeat(theta[:, None], COLUMNS, axis=1), mean, inv_std, policy.network)

@@ -51,6 +51,8 @@ def practise(
     if loop.experiment_of(source).task.robot.contract != PAPER:
         raise ConfigError(f"{policy}: expected a policy of the paper's robot, whose worlds can be identified")
     if robot == LOCK_STEP:
+        if rallies is not None:
+            raise ConfigError(f"--rallies {rallies}: lock-step ends after --balls or --seconds; give one of them")
         return in_lock_step.practise(source, folder, console, setup, updates, balls, seconds)
 
     def accompany(session: ControlSession) -> Companion:
@@ -87,7 +89,7 @@ class Companion:
 
     def __init__(self, session: ControlSession, assignment: Assignment, console: Console) -> None:
         self._session, self._assignment, self._console = session, assignment, console
-        self.allowed, self.exchanges = True, 0
+        self._starts = 0
         self._waiting: Advice | None = None
         self._asked, self._version, self._ended = False, 0, 0.0
         self._start()
@@ -95,7 +97,10 @@ class Companion:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=advise, args=(self._assignment, theirs), daemon=True)
+        # What a process before it has made stays, and has the same names.
+        given = replace(self._assignment, folder=self._assignment.folder / str(self._starts))
+        self._starts += 1
+        self._process = context.Process(target=advise, args=(given, theirs), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -107,7 +112,7 @@ class Companion:
         if isinstance(message, PolicySet) and message.version == self._version:
             assert waiting.exchange is not None
             self._assignment = replace(self._assignment, policy=waiting.exchange.policy)
-            self._waiting, self.exchanges = None, self.exchanges + 1
+            self._waiting = None
             self._console.print(f"policy {self._version} is in play: {waiting.sentence}", highlight=False)
         elif isinstance(message, Refused) and isinstance(message.request, SetPolicy):
             self._asked = False  # the ball before is still played
@@ -123,7 +128,7 @@ class Companion:
                     self._version += 1
         except (EOFError, OSError):
             self._restart()
-        if self._waiting is not None and self._waiting.policy is not None and self.allowed and not self._asked:
+        if self._waiting is not None and self._waiting.policy is not None and not self._asked:
             self._session.send(SetPolicy(self._waiting.policy, self._version))
             self._asked = True
 

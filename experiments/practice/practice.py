@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from ballmodel.distribution import save_distribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.registry import Balls
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments.practice import beliefs
-from experiments.practice.learner import Learner, Trial, save_balls
+from experiments.practice.learner import Learner, Trial
 from experiments.runs import lines, load_policy
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.monitor.cusum import Alarm, Cusum
@@ -139,7 +140,8 @@ class Practice:
 
     def _train(self, number: int, world: Path, sentence: str) -> Exchange | None:
         began, human = time.monotonic(), self._person()
-        balls = save_balls(human, self.folder / f"balls{number}.yaml")
+        balls = self.folder / f"balls{number}.yaml"
+        save_distribution(balls, human)
         trained = self._learner.train(world, balls, self.policy, self.folder / f"policy{number}")
         trial = self._learner.compare(load_policy.load(self.policy).policy, trained.policy, self.world, human)
         seconds = round(time.monotonic() - began, 1)

@@ -12,7 +12,7 @@ zeros.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -30,7 +30,7 @@ from ballmodel.trajectory import Dataset, Trajectory
 from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.hidden_effects import CAMERA_RATE
 from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.env.episode import RETURNED, Episodes, EpisodeState, Tick
+from mjx_tt.env.episode import Episodes, EpisodeState, Tick
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.task import Task
@@ -39,8 +39,7 @@ from mjx_tt.rally.simulator import RallySimulator
 from mjx_tt.sim import actuators, latency
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import FESTO_JOINTS
-from robot_io.limits import LIMITS, JointLimits
+from robot_io.contract import FESTO_JOINTS, LIMITS, JointLimits
 
 REST = 0.5  # [s] before the first motion, in which the joints stand where they are
 SINES = 6
@@ -129,7 +128,6 @@ class HitLog:
 
     balls: Dataset
     joints: tuple[JointRecord, ...]
-    returned: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # (n,) by the robot; of a simulation alone
 
 
 def record_hits(
@@ -152,13 +150,11 @@ def record_hits(
     state, task = simulator.start(player, model, start_key, RALLIES), simulator.task
     balls: list[Trajectory] = []
     states: list[_States] = []
-    returned: list[np.ndarray] = []
     for turn in range(TURNS):
         turn_key = jax.random.fold_in(play_key, turn)
         episodes = simulator.episodes(turn_key, model, state)
         watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
-        state, shots = simulator.shots(policy, player, model, state, turn_key)
-        returned.append(np.asarray(shots.outcome == RETURNED))
+        state, _ = simulator.shots(policy, player, model, state, turn_key)
         seen = hidden_effects.observe(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
         late_by = np.asarray(episodes.latency)
         for rally in range(RALLIES):
@@ -169,7 +165,7 @@ def record_hits(
             balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, rally]))
             commands, encoders = (np.asarray(x)[..., rally] for x in watched[1:])
             states.append(_States(begin, late_by[:, rally], commands, encoders))
-    return HitLog(Dataset(tuple(balls), session), _records(task, model, states), np.concatenate(returned))
+    return HitLog(Dataset(tuple(balls), session), _records(task, model, states))
 
 
 @dataclass(frozen=True)
