@@ -70,10 +70,9 @@ class Practice:
         folder: Path,
         learner: Learner,
         say: Callable[[str], None],
-        believed: ModelFile | None = None,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.folder, self.policy, self.world = folder, policy, believed or ModelFile(SimModel())
+        self.folder, self.policy, self.world = folder, policy, ModelFile(SimModel())
         self.alarm: Alarm | None = None
         self.version = self.count = 0
         self._learner, self._say, self._human = learner, say, balls

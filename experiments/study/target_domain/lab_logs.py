@@ -39,7 +39,8 @@ from mjx_tt.rally.simulator import RallySimulator
 from mjx_tt.sim import actuators, latency
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import FESTO_JOINTS, LIMITS, JointLimits
+from robot_io.contract import FESTO_JOINTS
+from robot_io.limits import LIMITS, JointLimits
 
 REST = 0.5  # [s] before the first motion, in which the joints stand where they are
 SINES = 6

@@ -61,11 +61,6 @@ class Cusum:
         self._begun: Int[np.ndarray, "2 M"] = np.zeros((2, len(names)), int)
         self._seen: list[Float[np.ndarray, " M"]] = []
 
-    @property
-    def level(self) -> float:
-        """Largest sum as a share of the height at which it is an alarm."""
-        return float(self._sums.max(initial=0.0) / self.height)
-
     def add(self, score: Float[np.ndarray, " M"]) -> Alarm | None:
         """Takes the next ball's scores; the alarm that they raise, if any."""
         whole = np.where(self._shown, (score - self._mean) / self._deviation, np.nan)
